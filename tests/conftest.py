@@ -1,0 +1,35 @@
+"""What every test runs under: the CPU, the compilation cache of the checkout, strict promotion of types and ranks."""
+
+import os
+from pathlib import Path
+
+CACHE = Path(__file__).resolve().parent.parent / ".cache"
+
+# Before jax is imported, which reads them once; the commands that tests start inherit them.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("MPLBACKEND", "agg")
+
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+# Examples are the same in every run; how long one takes depends on the machine.
+hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=30)
+hypothesis.settings.load_profile("repeatable")
+
+JAX_VERSION = tuple(int(part) for part in jax.__version__.split(".")[:2])
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skips tests of brax's own trainers where jax lacks what they call."""
+    if JAX_VERSION >= (0, 10):
+        reason = pytest.mark.skip(
+            reason=f"brax's trainers call jax.device_put_replicated, gone from jax {jax.__version__}"
+        )
+        for item in items:
+            if item.get_closest_marker("brax_trainer"):
+                item.add_marker(reason)

@@ -1,0 +1,49 @@
+"""Made-up results of an evaluation, for tests of what is done with them."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vsearch_jax.types import ReachabilityMap, View
+
+
+def trials(shape: tuple[int, ...], generations: int, seed: int = 0) -> dict[str, Any]:
+    """Made-up arrays of `evaluate` for one searcher."""
+    random = np.random.default_rng(seed)
+    is_success = random.random(shape) < 0.9
+    rotation = np.where(is_success, random.gamma(2.0, 0.03, shape), 2.5).astype(np.float32)
+    best = np.sort(random.random((*shape, generations)) ** 0.2, axis=-1).astype(np.float32)
+    view = View(random.random(shape).astype(np.float32), random.random(shape).astype(np.float32))
+    return {
+        "is_success": is_success,
+        "evaluations": random.integers(2, 10 * generations, shape).astype(np.int32),
+        "final_cosine": best[..., -1],
+        "rotation_error": rotation,
+        "frobenius_angle": rotation / 2,
+        "translation_error": 0.35 * rotation,
+        "is_false_positive": is_success & (rotation > np.deg2rad(10)),
+        "unreachable": random.integers(0, 2, shape).astype(np.int32),
+        "best_scores": best,
+        "initial_view": view,
+        "target_view": view,
+    }
+
+
+def evaluation(num_seeds: int = 1) -> dict[str, Any]:
+    """Made-up arrays of `evaluate`."""
+    shape = (num_seeds, 40)
+    steps = {"evaluations": np.full(shape, 4), "steps_lower_bound": np.full(shape, 3)}
+    return {"random_search": trials((12,), 30), "cma_es": trials((12,), 30, 1), "sac": trials(shape, 20) | steps}
+
+
+def reach() -> ReachabilityMap:
+    """A map whose reachable cells are those of the band."""
+    elevations = jnp.linspace(0, jnp.pi / 2, 7)
+    return ReachabilityMap(
+        azimuths=jnp.linspace(0, 2 * jnp.pi, 12, endpoint=False),
+        elevations=elevations,
+        is_reachable=jnp.broadcast_to((elevations > 0.6) & (elevations < 1.3), (12, 7)),
+        qpos=jnp.zeros((12, 7, 9)),
+        band=jnp.asarray([0.785, 1.047]),
+    )

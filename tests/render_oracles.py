@@ -1,0 +1,100 @@
+"""C MuJoCo's rays as an oracle of the renderer, and random scenes to try it on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import mjtGeom
+
+SOLIDS = tuple(
+    getattr(mjtGeom, f"mjGEOM_{name}") for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
+)
+
+
+class Poses(NamedTuple):
+    """The part of mjx.Data that the renderer reads."""
+
+    geom_xpos: np.ndarray
+    geom_xmat: np.ndarray
+    cam_xpos: np.ndarray
+    cam_xmat: np.ndarray
+
+
+def poses(model: mujoco.MjModel, data: mujoco.MjData) -> Poses:
+    rotations = data.geom_xmat.reshape(model.ngeom, 3, 3).astype(np.float32)
+    cameras = data.cam_xmat.reshape(model.ncam, 3, 3).astype(np.float32)
+    return Poses(data.geom_xpos.astype(np.float32), rotations, data.cam_xpos.astype(np.float32), cameras)
+
+
+def random_size(kind: int, rng: np.random.Generator) -> np.ndarray:
+    used = {mjtGeom.mjGEOM_SPHERE: 1, mjtGeom.mjGEOM_CAPSULE: 2, mjtGeom.mjGEOM_CYLINDER: 2, mjtGeom.mjGEOM_PLANE: 2}
+    size = rng.uniform(0.05, 0.5, size=3)
+    size[used.get(mjtGeom(kind), 3) :] = 0.0
+    return size
+
+
+def random_scene(rng: np.random.Generator, num_geoms: int = 20, plane: bool = True) -> mujoco.MjModel:
+    """A finite and an endless plane and `num_geoms` solids in their own bodies, before a camera `eye` at random."""
+    spec = mujoco.MjSpec()
+    world = spec.worldbody
+    if plane:
+        world.add_geom(type=mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, -0.6])
+        world.add_geom(type=mjtGeom.mjGEOM_PLANE, size=[0.5, 0.3, 1], pos=[0.3, 0.2, -0.4], quat=rng.normal(size=4))
+    for index in range(num_geoms):
+        kind = SOLIDS[index % len(SOLIDS)]
+        body = world.add_body(pos=rng.uniform(-0.9, 0.9, size=3), quat=rng.normal(size=4))
+        body.add_geom(type=kind, size=random_size(kind, rng) * 0.5, rgba=[*rng.uniform(0.2, 0.9, size=3), 1])
+    eye = rng.normal(size=3)
+    eye *= rng.uniform(1.0, 2.0) / np.linalg.norm(eye)
+    eye[2] = abs(eye[2])
+    world.add_camera(name="eye", pos=eye, quat=look_at(eye, rng.uniform(-0.2, 0.2, size=3)), fovy=rng.uniform(30.0, 70.0))
+    return spec.compile()
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Returns the quaternion of a camera at `eye` that looks at `target`, upright."""
+    backward = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    right /= np.linalg.norm(right)
+    matrix, quaternion = np.stack([right, np.cross(backward, right), backward], axis=1), np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix).reshape(9))
+    return quaternion
+
+
+def forward(model: mujoco.MjModel) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def pixel_directions(model: mujoco.MjModel, data: mujoco.MjData, camera: int, size: tuple[int, int]) -> np.ndarray:
+    """Returns f64[H, W, 3], rays through the pixels' centres whose part along the optical axis is 1, in world."""
+    height, width = size
+    scale = 2.0 * np.tan(0.5 * np.deg2rad(model.cam_fovy[camera])) / height
+    columns, rows = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    local = np.stack([scale * columns, -scale * rows, -np.ones_like(columns)], axis=-1)
+    return local @ data.cam_xmat[camera].reshape(3, 3).T
+
+
+def cast_image(
+    model: mujoco.MjModel, data: mujoco.MjData, camera: int, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns mj_multiRay's depth f64[H, W] (+inf on a miss) and geom number i32[H, W] (-1 on a miss)."""
+    directions = pixel_directions(model, data, camera, size)
+    count = size[0] * size[1]
+    ids, distances = np.zeros(count, np.int32), np.zeros(count)
+    origin = data.cam_xpos[camera]
+    mujoco.mj_multiRay(
+        model, data, origin, directions.reshape(-1), None, True, -1, ids, distances, None, count, mujoco.mjMAXVAL
+    )
+    return np.where(ids >= 0, distances, np.inf).reshape(size), ids.reshape(size)
+
+
+def on_outline(ids: np.ndarray) -> np.ndarray:
+    """Returns bool[H, W]: one of the eight neighbours shows another geom."""
+    padded = np.pad(ids, 1, mode="edge")
+    height, width = ids.shape
+    shifts = [(i, j) for i in range(3) for j in range(3)]
+    return np.any([padded[i : i + height, j : j + width] != ids for i, j in shifts], axis=0)

@@ -1,0 +1,257 @@
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+import standin
+
+from vsearch_jax import checkpoint, cli, runner
+from vsearch_jax.config import Config
+from vsearch_jax.metrics_log import STAGES, MetricsLog, read_metrics
+from vsearch_jax.run_folder import read_config
+
+ROOT = Path(__file__).resolve().parent.parent
+STANDIN = str(ROOT / "tests" / "standin.py")
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stand-in for init, train and evaluate, without its pauses."""
+    for name in ("init", "train", "evaluate"):
+        monkeypatch.setattr(runner, name, getattr(standin, name))
+    monkeypatch.setattr(standin, "CHUNK_SECONDS", 0.0)
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Runs the command, which is to fail as a user's error does, and returns its one line."""
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(arguments)
+    captured = capsys.readouterr()
+    assert exit_.value.code == 2
+    assert captured.err.startswith("vsearch: error: ") and captured.err.count("\n") == 1, captured.err
+    return captured.err
+
+
+def program(*arguments: str) -> dict[str, Any]:
+    """What subprocess needs to run a program: without the cache, whose entries XLA comments on."""
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    return {"args": [sys.executable, *arguments], "env": environment, "text": True}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def stored_state(run: Path) -> dict[str, np.ndarray]:
+    step = checkpoint.latest_step(run)
+    with ocp.CheckpointManager(run / "checkpoints") as manager:
+        arguments = ocp.args.Composite(state=ocp.args.StandardRestore())
+        return {name: np.asarray(value) for name, value in manager.restore(step, args=arguments)["state"].items()}
+
+
+def without_times(run: Path) -> list[dict[str, Any]]:
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in read_metrics(run)]
+
+
+def test_help_comes_without_jax() -> None:
+    code = "import sys; sys.argv = ['vsearch', 'train', '--help']\nfrom vsearch_jax.cli import main\n"
+    code += "try: main()\nexcept SystemExit as e: print('jax' in sys.modules, e.code)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False 0"
+    for option in ("--preset", "--object", "--arm", "--input", "--resume", "--sac.num-seeds", "--encoder.num-updates"):
+        assert option in done.stdout
+
+
+def test_options_change_the_preset() -> None:
+    options = "--preset smoke --out x --object truck --input depth --sac.num-seeds 4 --encoder.channels 4 8"
+    command = cli.parse(["train", *options.split()])
+    assert isinstance(command, cli.Train)
+    config = command.config
+    assert (config.scene.object, config.encoder.input, config.sac.num_seeds) == ("truck", "depth", 4)
+    assert config.encoder.channels == (4, 8)
+    assert config.sac.num_envs == Config.preset("smoke").sac.num_envs
+
+
+def test_paths_are_made_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = cli.parse(["train", "--out", "x", "--object", "part.stl", "--scene.arm", "arms/own.xml"])
+    assert isinstance(command, cli.Train)
+    assert command.config.scene.object == str(tmp_path / "part.stl")
+    assert command.config.scene.arm == str(tmp_path / "arms" / "own.xml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "train, eval, export"),
+        ("bogus", "bogus"),
+        ("train", "--out"),
+        ("train --out {out} --preset huge", "unknown preset 'huge'; allowed: smoke, cpu, thesis, gpu"),
+        ("train --out {out} --encoder.num-updates 0", "EncoderConfig.num_updates is 0; allowed: greater than 0"),
+        ("train --out {out} --encoder.num-updates many", "--encoder.num-updates: invalid literal for int.* 'many'"),
+        ("train --out {out} --input infrared", "infrared"),
+        ("train --out {out} --bogus 1", "--bogus"),
+        ("train --out {out} --resume", "no run in"),
+        ("eval {out}", "no run in .*config.json is missing"),
+        ("export {out} --out {out}2", "no run in"),
+    ],
+)
+def test_a_users_error_is_one_line_and_makes_nothing(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: str, message: str
+) -> None:
+    assert re.search(message, fails(capsys, *arguments.format(out=tmp_path / "run").split()))
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [("--object nothing", "unknown object 'nothing'"), ("--arm {out}/own.xml", "arm file .*own.xml' does not exist")],
+)
+def test_what_cannot_be_built_leaves_the_folder_empty(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, option: str, message: str
+) -> None:
+    out = tmp_path / "run"
+    command = f"train --preset smoke --out {out} {option.format(out=tmp_path)}"
+    assert re.search(message, fails(capsys, *command.split()))
+    assert not any(out.iterdir())
+
+
+def test_a_run_makes_all_of_its_folder(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "run"
+    cli.main(["train", "--preset", "smoke", "--out", str(out), "--sac.num-seeds", "2"])
+    config = read_config(out)
+    assert config.sac.num_seeds == 2
+    lines = read_metrics(out)
+    assert [line["iteration"] for line in lines] == list(range(config.num_iterations))
+    assert all(("encoder_loss" in line) == (line["stage"] == "encoder") for line in lines)
+    assert all(("reward" in line) == (line["stage"] == "policy") for line in lines)
+    assert checkpoint.latest_step(out) == config.num_iterations
+    assert {path.name for path in out.iterdir()} == {
+        "checkpoints",
+        "config.json",
+        "figures",
+        "metrics.jsonl",
+        "report.html",
+        "results.json",
+        "tensorboard",
+    }
+    results = json.loads((out / "results.json").read_text())
+    assert len(results["sac"]["seeds"]) == 2
+    assert set(results["wall_seconds"]) == {*STAGES, "evaluation"}
+    printed = capsys.readouterr().out
+    assert "Soft actor-critic" in printed and f"{config.num_iterations}/{config.num_iterations} policy" in printed
+
+
+def test_a_folder_that_exists_is_never_reused(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    assert "exists" in fails(capsys, "train", "--preset", "smoke", "--out", str(out))
+    assert contents(out) == {"notes.txt": b"mine"}
+
+
+def test_resume_with_another_config_names_the_field_and_changes_nothing(
+    quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = str(tmp_path / "run")
+    cli.main(["train", "--preset", "smoke", "--out", out])
+    before = contents(tmp_path)
+    message = fails(capsys, "train", "--out", out, "--resume", "--sac.discount", "0.5")
+    assert "sac.discount is 0.9 there and 0.5 here" in message
+    assert contents(tmp_path) == before
+
+
+def test_an_unfinished_run_is_not_evaluated(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    config = Config.preset("smoke")
+    runner.start(tmp_path / "run", config, seed=0)
+    message = fails(capsys, "eval", str(tmp_path / "run"))
+    assert f"0 of {config.num_iterations} iterations" in message and "--resume" in message
+
+
+def test_damaged_config_is_one_line(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    runner.start(tmp_path, Config.preset("smoke"), seed=0)
+    whole = (tmp_path / "config.json").read_text()
+    for text, message in {"": "not JSON", "[]": "no JSON object", whole.replace('"arm"', '"leg"'): "leg"}.items():
+        (tmp_path / "config.json").write_text(text)
+        assert message in fails(capsys, "eval", str(tmp_path))
+
+
+@pytest.mark.parametrize(("file_limit", "is_started"), [(1_000, False), (2_500, False), (9_000, True)])
+def test_full_disk_is_one_line_and_keeps_what_was_saved(tmp_path: Path, file_limit: int, is_started: bool) -> None:
+    out = tmp_path / "run"
+    # No file may grow past the limit: config.json, the first checkpoint or a figure is the first to be larger.
+    code = f"import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({file_limit}, {file_limit}));"
+    code += f"sys.path.insert(0, {str(ROOT / 'tests')!r}); sys.argv[0] = {STANDIN!r};"
+    code += f"runpy.run_path({STANDIN!r}, run_name='__main__')"
+    command = program("-c", code, "train", "--preset", "smoke", "--out", str(out))
+    done = subprocess.run(**command, capture_output=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("vsearch: error: cannot write") and str(out) in done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert any(out.iterdir()) == is_started
+    assert checkpoint.latest_step(out) == (24 if is_started else None)
+
+
+def wait_for_step(out: Path, step: int, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 120
+    while (checkpoint.latest_step(out) or 0) < step:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_killed_and_resumed_equals_uninterrupted(quick: None, tmp_path: Path) -> None:
+    arguments = ["train", "--preset", "smoke", "--seed", "3", "--out"]
+    cli.main([*arguments, str(tmp_path / "whole")])
+    out = tmp_path / "killed"
+    process = subprocess.Popen(**program(STANDIN, *arguments, str(out)), stdout=subprocess.DEVNULL)
+    wait_for_step(out, 6, process)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (out / "results.json").exists()
+    with (out / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 23, "sta')  # as a kill within a write leaves it
+    cli.main([*arguments, str(out), "--resume"])
+    assert without_times(out) == without_times(tmp_path / "whole")
+    whole, killed = stored_state(tmp_path / "whole"), stored_state(out)
+    assert whole.keys() == killed.keys()
+    for name in whole:
+        np.testing.assert_array_equal(whole[name], killed[name], err_msg=name)
+    assert (out / "results.json").exists()
+
+
+@pytest.mark.parametrize("signal_", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_says_how_to_go_on(quick: None, tmp_path: Path, signal_: signal.Signals) -> None:
+    out = tmp_path / "run"
+    command = ["train", "--preset", "smoke", "--out", str(out)]
+    process = subprocess.Popen(**program(STANDIN, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    wait_for_step(out, 6, process)
+    process.send_signal(signal_)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    step = checkpoint.latest_step(out)
+    line = f"vsearch: interrupted; {step} iterations are saved. Go on with: vsearch train --out {out} --resume"
+    assert errors.strip() == line
+    cli.main([*command, "--resume"])
+    assert checkpoint.latest_step(out) == Config.preset("smoke").num_iterations
+
+
+def test_log_drops_what_lies_past_the_step_it_goes_on_from(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path, 0)
+    columns = {"stage": np.zeros(6, np.int32), "encoder_loss": np.arange(6.0), "reward": np.full(6, np.nan)}
+    log.append(columns, 0, 3.0)
+    log.close()
+    log = MetricsLog(tmp_path, 4)
+    log.append({name: column[4:5] for name, column in columns.items()}, 4, 1.0)
+    log.close()
+    lines = read_metrics(tmp_path)
+    assert [line["iteration"] for line in lines] == [0, 1, 2, 3, 4]
+    assert lines[3] == {"iteration": 3, "stage": "encoder", "seconds": 0.5, "encoder_loss": 3.0}
+    assert any((tmp_path / "tensorboard").iterdir())

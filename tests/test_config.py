@@ -1,0 +1,60 @@
+"""Presets, validation messages and the JSON round trip."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from vsearch_jax.config import PRESETS, Config, ConfigError, EncoderConfig, EvaluationConfig, SACConfig, SceneConfig
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_survives_json_and_hashes(name):
+    config = Config.preset(name)
+    again = Config.from_dict(json.loads(json.dumps(config.to_dict())))
+    assert again == config
+    assert hash(again) == hash(config)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_keep_the_task_of_the_thesis(name):
+    config = Config.preset(name)
+    assert (config.env.threshold, config.env.action_scale_deg, config.scene.radius) == (0.98, 30.0, 0.35)
+    assert config.sac.num_environment_steps <= 11_000
+    assert (config.random_search.num_samples, config.cma_es.population, config.random_search.k) == (10, 10, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("build", "field", "value"),
+    [
+        (lambda: SceneConfig(radius=-0.1), "SceneConfig.radius", "-0.1"),
+        (lambda: SceneConfig(image_size=100), "SceneConfig.image_size", "100"),
+        (lambda: SceneConfig(radius=float("nan")), "SceneConfig.radius", "nan"),
+        (lambda: EncoderConfig(input="sound"), "EncoderConfig.input", "sound"),
+        (lambda: EncoderConfig(bootstrap_fraction=0.0), "EncoderConfig.bootstrap_fraction", "0.0"),
+        (lambda: SACConfig(num_envs=7), "SACConfig.num_environment_steps", "multiple of num_envs"),
+        (lambda: SACConfig(discount=1.5), "SACConfig.discount", "from 0 to 1"),
+        (lambda: EvaluationConfig(num_initial_views=5), "EvaluationConfig.num_initial_views", "multiple of 4"),
+        (lambda: dataclasses.replace(Config.preset("smoke"), num_chunks=0), "Config.num_chunks", "from 1 to"),
+    ],
+)
+def test_a_value_out_of_range_is_named(build, field, value):
+    with pytest.raises(ConfigError) as error:
+        build()
+    assert field in str(error.value)
+    assert value in str(error.value)
+
+
+def test_an_unknown_preset_is_named_with_those_that_exist():
+    with pytest.raises(ConfigError, match=r"unknown preset 'big'; allowed: smoke, cpu, thesis, gpu"):
+        Config.preset("big")
+
+
+def test_fields_that_do_not_fit_are_named():
+    values = Config.preset("smoke").to_dict()
+    values["encoder"]["colour"] = 1
+    del values["encoder"]["channels"]
+    with pytest.raises(ConfigError, match=r"EncoderConfig: unknown fields \['colour'\], missing fields \['channels'\]"):
+        Config.from_dict(values)

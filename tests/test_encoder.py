@@ -1,0 +1,261 @@
+"""Autoencoder: layers against XLA's convolution, loss against a sort, whitening, augmentation, learning."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import optax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vsearch_jax import encoder as encoders
+from vsearch_jax.config import PRESETS, Config, ConfigError, EncoderConfig
+from vsearch_jax.encoder import augment, fit, network
+from vsearch_jax.render import compile_scene
+from vsearch_jax.types import Camera, Image
+
+INPUTS = ("rgb", "depth", "silhouette")
+CENTER = np.array([0.0, 0.0, 0.05], np.float32)
+LIT_MODEL = """
+<mujoco>
+  <worldbody>
+    <light pos="0.9 -0.7 1.3" dir="-0.9 0.7 -1.3" type="directional" diffuse="0.6 0.5 0.4" specular="0.4 0.4 0.4"/>
+    <light pos="0 0 2" diffuse="0.2 0.2 0.2"/>
+    <geom type="sphere" size="0.05"/>
+  </worldbody>
+</mujoco>
+"""
+BOOTSTRAPPED = jax.jit(jax.value_and_grad(fit.bootstrapped_mean), static_argnums=1)
+
+
+def small_config(**encoder):
+    smoke = PRESETS["smoke"]
+    return dataclasses.replace(smoke, encoder=dataclasses.replace(smoke.encoder, **encoder))
+
+
+# -- layers ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kernel_size", "stride"), [(3, 2), (5, 2), (8, 4)])
+def test_both_forms_of_the_convolution_agree_with_their_gradients(kernel_size, stride):
+    x_key, kernel_key, weight_key = jax.random.split(jax.random.key(kernel_size), 3)
+    x = jax.random.normal(x_key, (2, 16, 24, 3))
+    kernel = jax.random.normal(kernel_key, (kernel_size, kernel_size, 3, 5))
+    weights = jax.random.normal(weight_key, (2, 16 // stride, 24 // stride, 5))
+
+    def total(convolution, x, kernel):
+        return jnp.sum(weights * jax.vmap(convolution, in_axes=(0, None, None))(x, kernel, stride))
+
+    for argument in (0, 1):
+        ours, xla = (
+            jax.jit(jax.grad(functools.partial(total, form), argnums=argument))(x, kernel)
+            for form in (network.convolution_by_matmul, network.convolution_by_xla)
+        )
+        np.testing.assert_allclose(ours, xla, rtol=1e-4, atol=1e-3)
+    ours, xla = (form(x[0], kernel, stride) for form in (network.convolution_by_matmul, network.convolution_by_xla))
+    assert ours.shape == (16 // stride, 24 // stride, 5)
+    np.testing.assert_allclose(ours, xla, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("kind", INPUTS)
+def test_every_preset_and_input_gives_a_code_and_a_picture(preset, kind):
+    config = Config.preset(preset)
+    config = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, input=kind))
+    features, size = 3 if kind == "rgb" else 1, config.scene.image_size
+    state = jax.eval_shape(lambda: encoders.init(jax.random.key(0), config))
+    x = jax.ShapeDtypeStruct((size, size, features), jnp.float32)
+    code = jax.eval_shape(functools.partial(encoders.encode, config=config), state, x)
+    picture = jax.eval_shape(functools.partial(encoders.reconstruct, config=config), state.params, code)
+    assert code.shape == (128,)
+    assert picture.shape == (config.encoder.decoder_size, config.encoder.decoder_size, features)
+
+
+def test_parameters_are_nested_dictionaries_of_arrays_drawn_from_the_key():
+    config = small_config()
+    first, again, other = (encoders.init(jax.random.key(seed), config).params for seed in (0, 0, 1))
+    assert set(first) == {"encoder", "decoder"}
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(first))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True))
+    assert not np.array_equal(first["encoder"]["dense"]["kernel"], other["encoder"]["dense"]["kernel"])
+
+
+def test_an_image_that_the_convolutions_do_not_divide_is_refused():
+    with pytest.raises(ConfigError, match=r"SceneConfig.image_size is 128; allowed: a multiple of 256"):
+        Config(encoder=EncoderConfig(channels=(8,) * 7, decoder_size=128))
+
+
+# -- code -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_code_has_mean_square_one_whatever_the_latent_s_scale_and_is_safe_at_zero():
+    state = encoders.init(jax.random.key(0), small_config())
+    raw = jax.random.normal(jax.random.key(1), (128,))
+    code = encoders.code_of(state, raw)
+    np.testing.assert_allclose(jnp.mean(code**2), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(encoders.code_of(state, 7.0 * raw), code, rtol=1e-4)
+    assert np.all(encoders.code_of(state, jnp.zeros(128)) == 0.0)
+    assert np.all(np.isfinite(jax.jacobian(functools.partial(encoders.code_of, state))(jnp.zeros(128))))
+
+
+def test_the_network_reads_what_the_config_says():
+    depth = jnp.array([[jnp.inf, 0.35], [0.175, 0.525]])
+    image = Image(rgb=jnp.full((2, 2, 3), 0.3), depth=depth, geom_id=jnp.array([[-1, 4], [2, 7]]))
+    rgb, depth, silhouette = (encoders.network_input(image, (4, 7), small_config(input=kind)) for kind in INPUTS)
+    np.testing.assert_array_equal(rgb, image.rgb)
+    np.testing.assert_allclose(depth[..., 0], [[1.0, 0.5], [0.0, 1.0]], atol=1e-6)
+    np.testing.assert_array_equal(silhouette[..., 0], [[0.0, 1.0], [0.0, 1.0]])
+
+
+# -- loss and whitening ---------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 1000), st.sampled_from([1.0, 0.5, 0.25, 0.1]), st.sampled_from([1.0, 1e-4, 1e3]))
+def test_the_bootstrapped_mean_is_that_of_the_largest_errors(seed, fraction, scale):
+    errors = np.float32(scale * np.random.default_rng(seed).exponential(size=200))
+    largest = np.sort(errors)[-round(fraction * 200) :]
+    value, gradient = BOOTSTRAPPED(errors, fraction)
+    np.testing.assert_allclose(value, largest.mean(), rtol=1e-4)
+    # Bisection may leave out or take in one error that is nearly at the threshold.
+    is_largest = errors >= largest[0]
+    assert np.sum((gradient > 0) != is_largest) <= 1
+    np.testing.assert_allclose(gradient[gradient > 0], 1.0 / (fraction * 200), rtol=1e-5)
+
+
+def test_the_bootstrapped_mean_of_equal_errors_is_their_value():
+    np.testing.assert_allclose(fit.bootstrapped_mean(jnp.full(16, 0.25), 0.25), 0.25, rtol=1e-4)
+    assert fit.bootstrapped_mean(jnp.zeros(16), 0.25) == 0.0
+
+
+def test_whitening_is_symmetric_and_goes_from_the_identity_to_unit_covariance():
+    mix = jax.random.normal(jax.random.key(0), (6, 6))
+    raw = 3.0 + jax.random.normal(jax.random.key(1), (500, 6)) @ mix
+    mean, identity = fit.fit_whitening(raw, 0.0)
+    np.testing.assert_allclose(mean, np.mean(raw, axis=0), atol=1e-5)
+    np.testing.assert_allclose(identity, np.eye(6), atol=1e-5)
+    _, quarter = fit.fit_whitening(raw, 0.25)
+    _, half = fit.fit_whitening(raw, 0.5)
+    np.testing.assert_allclose(half, half.T, atol=1e-4)
+    np.testing.assert_allclose(quarter @ quarter, half, rtol=1e-3, atol=1e-3)
+    covariance = np.cov((np.asarray(raw) @ np.asarray(half)).T)
+    np.testing.assert_allclose(covariance / covariance[0, 0], np.eye(6), atol=5e-3)
+
+
+def test_whitening_leaves_directions_of_noise_small_and_a_constant_latent_alone():
+    scales = jnp.array([1.0, 1e-6])
+    raw = jax.random.normal(jax.random.key(0), (500, 2)) * scales[None]
+    _, whitening = fit.fit_whitening(raw, 0.5)
+    assert np.linalg.eigvalsh(whitening).max() < 101.0
+    mean, whitening = fit.fit_whitening(jnp.ones((8, 3)), 0.5)
+    np.testing.assert_array_equal(mean, np.ones(3))
+    np.testing.assert_allclose(whitening, np.eye(3), atol=1e-6)
+
+
+# -- learning -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", INPUTS)
+def test_updates_learn_to_draw_the_targets_and_stop_after_num_updates(kind):
+    config = small_config(input=kind, num_updates=150, learning_rate=3e-3)
+    shape = (8, 32, 32, network.in_features(config.encoder))
+    inputs = jax.random.uniform(jax.random.key(1), shape)
+    targets = jax.image.resize(inputs, (8, 16, 16, shape[-1]), "linear")
+
+    def body(_, carry):
+        return encoders.update(carry[0], inputs, targets, config)
+
+    start = encoders.init(jax.random.key(0), config)
+    _, first = encoders.update(start, inputs, targets, config)
+    end, last = jax.jit(lambda state: jax.lax.fori_loop(0, 150, body, (state, 0.0)))(start)
+    assert float(last) < 0.35 * float(first)
+    after, _ = encoders.update(end, inputs, targets, config)
+    for a, b in zip(jax.tree.leaves(end.params), jax.tree.leaves(after.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    count = optax.tree_utils.tree_get(end.opt_state, "ScaleByAdamState").count
+    assert int(count) == 150
+
+
+# -- augmentation ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", INPUTS)
+def test_augmented_inputs_differ_by_key_and_stay_in_range(kind):
+    config = small_config(input=kind)
+    off, on = (0.0, 1.0) if kind == "silhouette" else (0.3, 0.7)
+    x = jnp.full((32, 32, network.in_features(config.encoder)), off).at[8:24, 8:24].set(on)
+    keys = jax.random.split(jax.random.key(0), 64)
+    apply = jax.jit(jax.vmap(lambda key: encoders.augment_input(key, x, x[..., 0] > 0.5, config)))
+    pictures = apply(keys)
+    assert pictures.shape == (64, *x.shape)
+    assert np.all((pictures >= 0.0) & (pictures <= 1.0))
+    assert len(np.unique(np.asarray(pictures).reshape(64, -1), axis=0)) == 64
+    np.testing.assert_array_equal(apply(keys), pictures)
+    if kind == "silhouette":
+        assert set(np.unique(pictures)) == {0.0, 1.0}
+
+
+def test_half_of_the_backgrounds_are_replaced_and_the_object_never():
+    x = jnp.full((16, 16, 3), 0.5)
+    is_object = jnp.zeros((16, 16), bool).at[4:12, 4:12].set(True)
+    keys = jax.random.split(jax.random.key(0), 400)
+    pictures = jax.vmap(augment.replace_background, in_axes=(0, None, None))(keys, x, is_object)
+    assert np.all(pictures[:, 4:12, 4:12] == 0.5)
+    is_replaced = np.any(pictures != 0.5, axis=(1, 2, 3))
+    assert abs(is_replaced.mean() - 0.5) < 4 * 0.5 / np.sqrt(400)  # four standard deviations
+    assert np.all(np.any(pictures[is_replaced] != 0.5, axis=-1)[:, ~is_object])
+
+
+def test_the_colour_matrix_keeps_grey_and_turns_at_most_by_its_limit():
+    matrices = jax.vmap(augment._color_matrix)(jax.random.split(jax.random.key(0), 100))
+    np.testing.assert_allclose(jnp.full(3, 0.4) @ matrices, 0.4, atol=1e-6)
+    red = np.array([1.0, -0.5, -0.5])
+    turned = red @ np.asarray(matrices)
+    cosine = turned @ red / np.linalg.norm(turned, axis=-1) / np.linalg.norm(red)
+    assert np.all(cosine >= np.cos(augment._MAX_HUE) - 1e-5)
+    assert cosine.min() < np.cos(0.8 * augment._MAX_HUE)
+
+
+def test_lights_keep_their_distance_and_shine_at_the_centre_from_above():
+    scene = compile_scene(mujoco.MjModel.from_xml_string(LIT_MODEL))
+    keys = jax.random.split(jax.random.key(0), 50)
+    lights = jax.vmap(encoders.randomize_lights, in_axes=(0, None, None))(keys, scene, CENTER).lights
+    offset = np.asarray(lights.position) - CENTER
+    distance = np.linalg.norm(offset, axis=-1)
+    np.testing.assert_allclose(
+        distance, np.tile(np.linalg.norm(np.asarray(scene.lights.position) - CENTER, axis=-1), (50, 1)), rtol=1e-5
+    )
+    np.testing.assert_allclose(lights.direction, -offset / distance[..., None], atol=1e-5)
+    height = -np.asarray(lights.direction)[..., 2]
+    assert np.all(height > 0.499)
+    assert height.min() < 0.55
+    assert abs(height.mean() - 0.75) < 0.06  # uniform over the cap: the height is uniform from 1/2 to 1
+    ratio = np.asarray(lights.diffuse) / np.asarray(scene.lights.diffuse)
+    assert np.all((ratio > 0.4 * 0.85 - 1e-5) & (ratio < 1.3 * 1.15 + 1e-5))
+
+
+def test_a_jittered_camera_stays_in_place_and_looks_a_little_aside():
+    camera = Camera(position=jnp.array([0.1, 0.2, 0.3]), rotation=jnp.eye(3), fovy=jnp.float32(0.6))
+    jittered = jax.vmap(encoders.jitter_camera, in_axes=(0, None))(jax.random.split(jax.random.key(0), 200), camera)
+    np.testing.assert_array_equal(jittered.position, np.tile(camera.position, (200, 1)))
+    np.testing.assert_allclose(
+        jittered.rotation @ jnp.swapaxes(jittered.rotation, 1, 2), np.tile(np.eye(3), (200, 1, 1)), atol=1e-6
+    )
+    aside = np.arccos(np.clip(jittered.rotation[:, 2, 2], -1.0, 1.0))
+    assert 0.04 * 0.6 < aside.max() <= 0.05 * 0.6 * np.sqrt(2) + 1e-4
+    assert np.all((jittered.fovy > 0.6 * 0.919) & (jittered.fovy < 0.6 * 1.081))
+
+
+def test_the_target_shows_the_object_alone():
+    is_object = jnp.array([[True, False]])
+    for kind, blank in zip(INPUTS, (0.0, 1.0, 0.0), strict=True):
+        config = small_config(input=kind)
+        x = jnp.full((1, 2, network.in_features(config.encoder)), 0.5)
+        target = encoders.clean_target(x, is_object, config)
+        assert np.all(target[0, 0] == 0.5)
+        assert np.all(target[0, 1] == blank)

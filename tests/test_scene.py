@@ -1,0 +1,194 @@
+import mujoco
+import numpy as np
+import pytest
+from second_arm import MJCF
+
+from vsearch_jax.config import SceneConfig
+from vsearch_jax.scene import SceneError, available, build_scene, xml_folder
+
+# SPEC.md 2: KUKA LWR 4+.
+LIMITS_DEG = [170, 120, 170, 120, 170, 120, 170]
+SPEEDS_DEG = [100, 110, 100, 130, 130, 180, 180]
+TORQUES = [176, 176, 100, 100, 100, 38, 38]
+AXES = [[0, 0, 1], [0, -1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, 1]]
+TETRAHEDRON = """
+v 1.0 2.0 3.0
+v 1.1 2.0 3.0
+v 1.0 2.05 3.0
+v 1.0 2.0 3.07
+f 1 3 2
+f 1 2 4
+f 2 3 4
+f 1 4 3
+"""
+
+
+@pytest.fixture(scope="module")
+def lwr() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(xml_folder() / "arm" / "lwr.xml"))
+
+
+def _bodies_of(model: mujoco.MjModel, prefix: str) -> list[int]:
+    return [b for b in range(model.nbody) if model.body(b).name.startswith(prefix)]
+
+
+def test_lwr_has_the_facts_of_the_data_sheet(lwr):
+    assert (lwr.nq, lwr.nv, lwr.nu) == (9, 9, 9)
+    np.testing.assert_allclose(np.rad2deg(lwr.jnt_range[:7]), [[-x, x] for x in LIMITS_DEG], rtol=1e-6)
+    np.testing.assert_allclose(np.rad2deg(lwr.jnt_user[:7, 0]), SPEEDS_DEG, rtol=1e-4)
+    np.testing.assert_array_equal(lwr.actuator_forcerange[:7], [[-x, x] for x in TORQUES])
+    np.testing.assert_array_equal(lwr.actuator_ctrlrange, lwr.jnt_range)
+    np.testing.assert_array_equal(lwr.jnt_axis[:7], AXES)
+    assert set(lwr.jnt_type[7:]) == {int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    assert set(lwr.geom_type) == {int(mujoco.mjtGeom.mjGEOM_CAPSULE)}
+
+
+def test_lwr_has_its_offsets_and_about_16_kg(lwr):
+    data = mujoco.MjData(lwr)
+    mujoco.mj_forward(lwr, data)
+    heights = [data.joint(name).xanchor[2] for name in ("A2", "A4", "A6")]
+    np.testing.assert_allclose(heights, [0.3105, 0.7105, 1.1005], atol=1e-9)
+    np.testing.assert_allclose(data.body("gripper").xpos, [0, 0, 1.1785], atol=1e-9)
+    gripper = sum(lwr.body(name).mass[0] for name in ("gripper", "finger_left", "finger_right"))
+    assert lwr.body_mass.sum() - gripper == pytest.approx(16.0)
+    assert np.all(lwr.body_inertia[1:] > 0)
+
+
+def test_the_camera_looks_along_the_tool_past_the_gripper(lwr):
+    data = mujoco.MjData(lwr)
+    data.qpos[:] = lwr.jnt_range[:, 1] * 0.5
+    mujoco.mj_forward(lwr, data)
+    np.testing.assert_allclose(data.cam_xpos[0], data.site("tcp").xpos, atol=1e-12)
+    forward = -data.cam_xmat[0].reshape(3, 3)[:, 2]
+    np.testing.assert_allclose(forward, data.site("tcp").xmat.reshape(3, 3)[:, 2], atol=1e-12)
+    # Every geom ends behind the plane of the camera: none can be in the picture.
+    ends = np.abs(data.geom_xmat.reshape(-1, 3, 3)[:, :, 2] @ forward) * lwr.geom_size[:, 1] + lwr.geom_size[:, 0]
+    assert np.all((data.geom_xpos - data.cam_xpos[0]) @ forward + ends < 0)
+
+
+def test_actuators_hold_the_hanging_arm():
+    model = build_scene(SceneConfig()).mj_model
+    data = mujoco.MjData(model)
+    target = np.array([0.3, 0.5, -0.2, 0.8, 0.1, -0.6, 0.4, 0.02, 0.02])
+    data.qpos[:], data.ctrl[:] = target, target
+    for _ in range(1000):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(data.qpos, target, atol=0.05)
+
+
+def test_scene_knows_its_parts():
+    scene = build_scene(SceneConfig())
+    model = scene.mj_model
+    assert [model.joint(j).name for j in scene.joint_ids] == [f"arm/A{i}" for i in range(1, 8)]
+    assert model.camera(scene.camera_id).name == "arm/wrist"
+    assert model.site(scene.tcp_site_id).name == "arm/tcp"
+    assert set(model.geom_bodyid[list(scene.arm_geom_ids)]) == set(_bodies_of(model, "arm/"))
+    assert set(model.geom_bodyid[list(scene.object_geom_ids)]) == set(_bodies_of(model, "object/"))
+    ids = [*scene.arm_geom_ids, *scene.object_geom_ids, *scene.mount_geom_ids, scene.table_geom_id]
+    assert sorted(ids) == list(range(model.ngeom))
+    assert model.light("main").castshadow[0] and not model.light("fill").castshadow[0]
+
+
+def test_the_arm_hangs_at_the_height_of_the_config():
+    scene = build_scene(SceneConfig(mount_height=1.1, radius=0.4, center_height=0.02))
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    base = data.body("arm/base")
+    np.testing.assert_allclose(base.xpos, [0, 0, 1.1], atol=1e-9)
+    np.testing.assert_allclose(base.xmat.reshape(3, 3)[:, 2], [0, 0, -1], atol=1e-9)
+    assert (scene.radius, scene.center[2]) == (0.4, 0.02)
+
+
+@pytest.mark.parametrize("name", available("objects"))
+def test_objects_stand_low_on_the_table_and_are_made_of_many_colours(name):
+    scene = build_scene(SceneConfig(object=name))
+    model, data = scene.mj_model, mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(model, data)
+    geoms = list(scene.object_geom_ids)
+    ray = np.zeros(1, np.int32)
+    group = None
+    # Feeling for the outline from four sides, by rays, finds what no formula of ours has to.
+    heights = np.linspace(-0.02, 0.2, 221)
+    hits = [
+        mujoco.mj_ray(model, data, np.array([2 * x, 2 * y, z]), np.array([-x, -y, 0.0]), group, 1, -1, ray) > 0
+        and ray[0] in geoms
+        for z in heights
+        for x, y in ((1, 0.001), (-1, 0.001), (0.001, 1), (0.001, -1))
+    ]
+    seen = heights[np.flatnonzero(np.reshape(hits, (-1, 4)).any(axis=1))]
+    assert -0.001 <= seen.min() <= 0.002
+    assert seen.max() <= 0.12
+    assert len(geoms) >= 6
+    assert len({tuple(color) for color in model.geom_rgba[geoms]}) >= 6
+    assert np.all(np.linalg.norm(data.geom_xpos[geoms, :2], axis=1) < 0.09)
+
+
+def test_there_are_three_objects():
+    assert len(available("objects")) >= 3
+
+
+def test_a_mesh_stands_in_the_middle_of_the_table(tmp_path):
+    path = tmp_path / "part.obj"
+    path.write_text(TETRAHEDRON)
+    scene = build_scene(SceneConfig(object=str(path)))
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    geom = scene.object_geom_ids[0]
+    vertices = scene.mj_model.mesh_vert @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    np.testing.assert_allclose(vertices.min(axis=0), [-0.05, -0.025, 0], atol=1e-6)
+    np.testing.assert_allclose(vertices.max(axis=0), [0.05, 0.025, 0.07], atol=1e-6)
+
+
+def test_another_arm_and_an_object_with_a_joint_fit_too(tmp_path):
+    arm, target = tmp_path / "arm.xml", tmp_path / "ball.xml"
+    arm.write_text(MJCF)
+    target.write_text('<mujoco><worldbody><body><freejoint/><geom size="0.05"/></body></worldbody></mujoco>')
+    scene = build_scene(SceneConfig(arm=str(arm), object=str(target)))
+    names = [scene.mj_model.joint(j).name.removeprefix("arm/") for j in scene.joint_ids]
+    assert names == ["rail", "yaw", "pitch", "elbow", "roll", "tilt", "turn"]
+    assert scene.mj_model.nq == 8
+
+
+@pytest.mark.parametrize(
+    ("part", "content", "words"),
+    [
+        ("object", None, ["object", "does not exist", "teapot"]),
+        ("arm", None, ["arm", "does not exist", "lwr"]),
+        ("object", "<mujoco><worldbody/></mujoco>", ["has no geom"]),
+        ("object", "<mujoco><world/></mujoco>", ["cannot be loaded", "unrecognized element"]),
+        ("arm", MJCF.replace('name="tcp"', ""), ["no site named 'tcp'"]),
+        ("arm", MJCF.replace('<camera name="wrist"', '<camera name="eye"'), ["no camera named 'wrist'"]),
+        (
+            "arm",
+            '<mujoco><worldbody><body><geom size="1"/><site name="tcp"/><camera name="wrist"/></body></worldbody></mujoco>',
+            ["no joint that moves the camera"],
+        ),
+        (
+            "arm",
+            '<mujoco><worldbody><body><freejoint name="fly"/><geom size="1"/><site name="tcp"/><camera name="wrist"/>'
+            "</body></worldbody></mujoco>",
+            ["'fly'", "hinge or a slide"],
+        ),
+    ],
+)
+def test_a_bad_file_is_told_in_one_line(tmp_path, part, content, words):
+    path = tmp_path / "file.xml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(SceneError) as caught:
+        build_scene(SceneConfig(**{part: str(path)}))
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in [str(path), *words]:
+        assert word in message
+
+
+def test_a_bad_mesh_and_an_unknown_name_are_told(tmp_path):
+    path = tmp_path / "part.stl"
+    path.write_text("no mesh")
+    with pytest.raises(SceneError, match=r"part\.stl.*cannot be loaded"):
+        build_scene(SceneConfig(object=str(path)))
+    with pytest.raises(SceneError, match="unknown object 'teepot'; available: bracket, teapot, truck"):
+        build_scene(SceneConfig(object="teepot"))
+    with pytest.raises(SceneError, match="unknown arm 'kuka'; available: lwr"):
+        build_scene(SceneConfig(arm="kuka"))

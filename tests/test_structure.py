@@ -1,0 +1,78 @@
+"""What holds for the tree as a whole: the wheel works outside the checkout, files stay small, names are as promised."""
+
+import ast
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import vsearch_jax
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = sorted(path for folder in ("vsearch_jax", "train", "eval") for path in (ROOT / folder).rglob("*.py"))
+
+
+def test_every_public_name_is_there() -> None:
+    for name in vsearch_jax.__all__:
+        assert getattr(vsearch_jax, name) is not None
+    assert set(vsearch_jax.__all__) <= set(dir(vsearch_jax))
+    with pytest.raises(AttributeError, match="no attribute 'bogus'"):
+        _ = vsearch_jax.bogus
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_files_and_functions_stay_small(path: Path) -> None:
+    text = path.read_text()
+    assert text.count("\n") <= 300
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            assert node.end_lineno is not None
+            assert node.end_lineno - node.lineno < 60, f"{node.name} is to be split"
+
+
+def test_every_pin_is_exact_and_names_no_registry() -> None:
+    for name in ("constraints.txt", "constraints-newest.txt"):
+        pins = [line for line in (ROOT / name).read_text().splitlines() if not line.startswith("#")]
+        assert len(pins) > 50
+        for pin in pins:
+            assert "==" in pin and "/" not in pin and "@" not in pin, pin
+
+
+def test_make_test_calls_every_hook_of_pre_commit() -> None:
+    hooks = [
+        line.split(":", 1)[1].strip()
+        for line in (ROOT / ".pre-commit-config.yaml").read_text().splitlines()
+        if "entry:" in line
+    ]
+    makefile = (ROOT / "Makefile").read_text()
+    assert hooks
+    for hook in hooks:
+        assert hook.replace(".venv", "$(VENV)") in makefile
+
+
+def test_the_wheel_works_outside_the_checkout(tmp_path: Path) -> None:
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    wheel = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path / "wheel"), str(ROOT)]
+    subprocess.run([*pip, *wheel], check=True)
+    (built,) = (tmp_path / "wheel").glob("*.whl")
+    site = tmp_path / "site"
+    subprocess.run([*pip, "install", "--no-deps", "--no-index", "--target", str(site), str(built)], check=True)
+    code = (
+        "import vsearch_jax; from vsearch_jax.config import SceneConfig; from vsearch_jax.scene import build_scene;"
+        "print(vsearch_jax.__file__, build_scene(SceneConfig()).mj_model.nq)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
+    )
+    assert done.stdout.splitlines()[-1] == f"{site / 'vsearch_jax' / '__init__.py'} 9"
+
+
+def test_version_is_that_of_the_project_file() -> None:
+    import importlib.metadata
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert importlib.metadata.version("vsearch_jax") == project["version"]

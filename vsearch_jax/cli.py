@@ -1,0 +1,250 @@
+"""The `vsearch` command. What is slow to import is imported when a subcommand runs, so that --help comes at once."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import itertools
+import os
+import re
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import tyro
+from rich.console import Console
+
+from vsearch_jax.config import PRESETS, Config
+from vsearch_jax.run_folder import claim, read_config
+
+DEFAULT_PRESET = "cpu"
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it: 128 + SIGINT."""
+
+
+class UsageError(ValueError):
+    """The command line can't be understood."""
+
+
+def _option(metavar: str, default: str) -> Any:
+    """Returns what --help shows of an option whose default comes from elsewhere."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+
+
+_Preset = Annotated[str | None, _option("{" + ",".join(PRESETS) + "}", DEFAULT_PRESET)]
+_Name = Annotated[str | None, _option("NAME|PATH", "as below")]
+_Input = Annotated[Literal["rgb", "depth", "silhouette"] | None, _option("{rgb,depth,silhouette}", "as below")]
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Trains encoder and policies, evaluates every searcher and writes a report, all into one new folder."""
+
+    out: Path
+    """Folder of the run; it must not exist, or hold nothing, unless --resume is given."""
+    preset: _Preset = None
+    """Where every value below starts from."""
+    seed: int = 0
+    """Of all random numbers of the run."""
+    object: _Name = None
+    """Short for --scene.object: a name (see xml/objects) or the path of an MJCF, OBJ or STL file."""
+    arm: _Name = None
+    """Short for --scene.arm: a name (see xml/arm) or the path of an MJCF file."""
+    input: _Input = None
+    """Short for --encoder.input."""
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Go on with the run in --out from its last checkpoint, with its config."""
+    config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Evaluates a finished run again and writes its results, figures and report anew."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder that `vsearch train` made."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Writes encoder and policy of a finished run as StableHLO files that run without this package."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder that `vsearch train` made."""
+    out: Path
+    """Folder of the files; it must not exist, or hold nothing."""
+    seed: int = 0
+    """Which of the run's policies."""
+
+
+Command = Train | Eval | Export
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """Returns the command that `arguments` spell; prints help and exits where they ask for it.
+
+    Raises:
+      UsageError: an argument is unknown, missing, or no value of its type.
+      ConfigError: a value is out of its range, or no preset has that name.
+      RunError: --resume, and --out holds no run.
+    """
+    train = Train(out=tyro.MISSING)
+    if list(arguments[:1]) == ["train"]:
+        train = dataclasses.replace(train, config=_starting_config(arguments[1:]))
+    # tyro reads the defaults, and so --help, from an instance.
+    command_type: Any = Union[  # noqa: UP007 # built from values, which the newer form can't be
+        Annotated[Train, tyro.conf.subcommand("train", default=train)],
+        Annotated[Eval, tyro.conf.subcommand("eval")],
+        Annotated[Export, tyro.conf.subcommand("export")],
+    ]
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            command = tyro.cli(
+                command_type, prog="vsearch", description="View search in JAX: train, evaluate, export.", args=arguments
+            )
+    except SystemExit as exit_:
+        if not exit_.code:
+            raise  # after --help
+        raise UsageError(_one_line(errors.getvalue())) from None
+    return _with_shortcuts(command) if isinstance(command, Train) else command
+
+
+def _starting_config(arguments: Sequence[str]) -> Config:
+    """Returns the config that the other options of `train` change: of the preset, or of the run that is to go on."""
+    preset, out = _value_of("--preset", arguments), _value_of("--out", arguments)
+    if preset is None and out is not None and "--resume" in arguments:
+        return read_config(Path(out))
+    return Config.preset(preset or DEFAULT_PRESET)
+
+
+def _value_of(option: str, arguments: Sequence[str]) -> str | None:
+    for i, argument in enumerate(arguments):
+        if argument == option:
+            return next(iter(arguments[i + 1 :]), None)
+        if argument.startswith(f"{option}="):
+            return argument.partition("=")[2]
+    return None
+
+
+def _with_shortcuts(command: Train) -> Train:
+    scene, encoder = command.config.scene, command.config.encoder
+    scene = dataclasses.replace(
+        scene, object=_absolute(command.object or scene.object), arm=_absolute(command.arm or scene.arm)
+    )
+    encoder = dataclasses.replace(encoder, input=command.input or encoder.input)
+    return dataclasses.replace(command, config=dataclasses.replace(command.config, scene=scene, encoder=encoder))
+
+
+def _absolute(name: str) -> str:
+    """Returns a path made absolute, since a run may go on from another folder; a plain name as it is."""
+    path = Path(name).expanduser()
+    return str(path.resolve()) if path.suffix or path.parent != Path(".") else name
+
+
+def _one_line(box: str) -> str:
+    """Returns the message in one of tyro's boxes, without its frame and the help below its first rule."""
+    # Where the terminal's encoding is not UTF-8 the frame is of spaces and the rules are of hyphens.
+    lines = [line.strip(" │╭╮╰╯─") for line in box.splitlines()]
+    below_title = itertools.dropwhile(lambda line: not line.strip("-"), lines[1:])
+    message = " ".join(itertools.takewhile(lambda line: line.strip("-"), below_title))
+    # tyro names the field of a nested config by a name of its own; ours is in the message.
+    return re.sub(r"Error parsing __tyro\S*: ", "", message)
+
+
+def run_train(command: Train) -> None:
+    """Runs `vsearch train`."""
+    runner = _import_runner()
+    from vsearch_jax.progress import training_progress
+
+    console, config = Console(), command.config
+    with console.status("building the scene, mapping what the arm can reach"):
+        if command.resume:
+            state = runner.resume(command.out, config)
+        else:
+            state = runner.start(command.out, config, command.seed)
+    with training_progress(console, config, int(state.step)) as update:
+        state = runner.finish_training(command.out, state, config, update)
+    _evaluate(command.out, state, config, console)
+
+
+def run_eval(command: Eval) -> None:
+    """Runs `vsearch eval`."""
+    runner = _import_runner()
+    console, config = Console(), read_config(command.run)
+    with console.status("reading the run"):
+        state = runner.resume(command.run, config)
+    _evaluate(command.run, state, config, console)
+
+
+def _evaluate(run: Path, state: Any, config: Config, console: Console) -> None:
+    runner = _import_runner()
+    from vsearch_jax import report
+
+    with console.status("evaluating every searcher"):
+        results = runner.finish_evaluation(run, state, config)
+    report.print_table(results, console)
+    console.print(f"report: {run / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def run_export(command: Export) -> None:
+    """Runs `vsearch export`."""
+    runner = _import_runner()
+    from vsearch_jax import export
+
+    config = read_config(command.run)
+    state = runner.resume(command.run, config)
+    runner.check_finished(command.run, state, config)
+    claim(command.out)
+    export.export(command.out, state, config, command.seed)
+    print(f"wrote {command.out}: encoder.stablehlo, policy.stablehlo, interface.json")
+
+
+def _import_runner() -> Any:
+    # mjx prints on import that Warp is missing, which nothing here needs.
+    with contextlib.redirect_stdout(io.StringIO()):
+        from vsearch_jax import runner
+    return runner
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line and exits: 0 when done, 2 after an error of the user's, 130 when interrupted."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    command = None
+    try:
+        command = parse(sys.argv[1:] if arguments is None else arguments)
+        run = {Train: run_train, Eval: run_eval, Export: run_export}[type(command)]
+        run(command)
+    except KeyboardInterrupt:
+        print(f"\nvsearch: {_interrupted(command)}", file=sys.stderr)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        # A computation may still run in its thread, and the interpreter would wait for it.
+        os._exit(INTERRUPTED)
+    except (ValueError, OSError) as error:
+        if not isinstance(error, OSError) and not type(error).__module__.startswith("vsearch_jax."):
+            raise  # our own errors tell users what to do; any other ValueError is a fault of ours
+        print(f"vsearch: error: {_describe(error, command)}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _describe(error: Exception, command: Command | None) -> str:
+    if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+        # The system says what, but not where: it is a write into the folder of the command, on a full disk for example.
+        folder = getattr(command, "out", None) or getattr(command, "run", None)
+        return f"cannot write to {folder}: {error.strerror}"
+    return str(error)
+
+
+def _interrupted(command: Command | None) -> str:
+    from vsearch_jax.checkpoint import latest_step
+
+    if not isinstance(command, Train):
+        return "interrupted"
+    step = latest_step(command.out)
+    if step is None:
+        return "interrupted before anything was saved; give the same command to start again"
+    return f"interrupted; {step} iterations are saved. Go on with: vsearch train --out {command.out} --resume"

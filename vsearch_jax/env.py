@@ -1,0 +1,202 @@
+"""The view-search task (SPEC.md 7) as a `brax.envs.Env`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+from jax import Array
+
+from vsearch_jax import encoder as encoders
+from vsearch_jax import render
+from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
+from vsearch_jax.config import Config
+from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
+from vsearch_jax.planning import nearest_cell, reachability_map, solve_view, start_limits
+from vsearch_jax.scene import build_scene
+from vsearch_jax.types import Camera, EncoderState, EpisodeState, Image, ReachabilityMap, Sight, View
+
+
+class ViewSearchEnv(Env):
+    """Moves a wrist camera over a sphere until its encoding matches that of a target view.
+
+    Written for one environment; batch by `vmap` or by brax's own wrappers.
+
+    Observation, f32[265] for the LWR: code (128) ‖ target code (128) ‖ joints in rad and m (9).
+    Action, f32[2] in [-1, 1]: change of azimuth and elevation in units of `config.env.action_scale_deg`.
+    Reward: cosine - 1; `success_reward` where the threshold is met; `unreachable_reward` where the arm can't reach the
+    view, and then it stays.
+
+    `done` is 1 where the episode terminated at the threshold. As brax expects, running out of steps is not `done`:
+    `info["truncated"]` says it, and brax's EpisodeWrapper ends the episode.
+    """
+
+    def __init__(
+        self, config: Config | None = None, encoder: EncoderState | None = None, reach: ReachabilityMap | None = None
+    ) -> None:
+        """Builds the scene; makes what is not given.
+
+        Args:
+          config: `Config.preset("cpu")` by default.
+          encoder: trained encoder; by default an untrained one, whose codes tell views apart only roughly.
+          reach: the arm's reachability map; computed by default.
+
+        Raises:
+          SceneError: arm or object can't be loaded.
+        """
+        self.config = config if config is not None else Config.preset("cpu")
+        self.scene = build_scene(self.config.scene)
+        self.center = jnp.asarray(self.scene.center, jnp.float32)
+        self.arm = build_arm(self.scene)
+        self.render_scene = render.compile_scene(self.scene.mj_model)
+        self.fovy = math.radians(float(self.scene.mj_model.cam_fovy[self.scene.camera_id]))
+        self.encoder = encoder if encoder is not None else encoders.init(jax.random.key(0), self.config)
+        self.reach = reach if reach is not None else jax.jit(self.map_reach)(jax.random.key(0))
+
+    @property
+    def observation_size(self) -> int:
+        """Entries of the observation."""
+        return 2 * self.config.encoder.code_size + self.scene.mj_model.nq
+
+    @property
+    def action_size(self) -> int:
+        """Entries of the action."""
+        return 2
+
+    @property
+    def backend(self) -> str:
+        """The physics backend, by brax's name."""
+        return "mjx"
+
+    def reset(self, rng: Array) -> State:
+        """Returns the start of an episode: initial view and target both random over the reachable band.
+
+        Args:
+          rng: PRNG key (the name is brax's).
+        """
+        initial_key, target_key = jax.random.split(rng)
+        return self.start(self.random_sight(initial_key), self.random_sight(target_key))
+
+    def start(self, sight: Sight, target: Sight) -> State:
+        """Returns the start of the episode that looks for `target` from `sight`."""
+        episode = EpisodeState(sight=sight, target=target, num_steps=jnp.zeros((), jnp.int32))
+        zero = jnp.zeros(())
+        info = {"terminated": zero, "truncated": zero, "is_reachable": jnp.ones(())}
+        metrics = {"similarity": cosine_similarity(sight.code, target.code), "unreachable": zero}
+        return State(
+            pipeline_state=episode,  # pyright: ignore[reportArgumentType] # brax lets any pytree stand here
+            obs=observe(episode),
+            reward=zero,
+            done=zero,
+            metrics=metrics,
+            info=info,
+        )
+
+    def step(self, state: State, action: Array) -> State:
+        """Returns the state after moving by `action` (f32[2], clipped to [-1, 1])."""
+        episode: EpisodeState = state.pipeline_state  # pyright: ignore[reportAssignmentType] # see start
+        task = self.config.env
+        delta = jnp.clip(action, -1.0, 1.0) * math.radians(task.action_scale_deg)
+        old = episode.sight
+        view = View(wrap_angle(old.view.azimuth + delta[0]), old.view.elevation + delta[1])
+        moved, is_reachable = self.look(view, old.qpos)
+        sight = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), moved, old)
+        similarity = cosine_similarity(sight.code, episode.target.code)
+        is_found = is_reachable & (similarity >= task.threshold)
+        reward = jnp.where(is_found, task.success_reward, similarity - 1.0)
+        reward = jnp.where(is_reachable, reward, task.unreachable_reward)
+        num_steps = episode.num_steps + 1
+        terminated = is_found.astype(jnp.float32)
+        truncated = (num_steps >= task.episode_length) & ~is_found
+        episode = EpisodeState(sight=sight, target=episode.target, num_steps=num_steps)
+        reached = is_reachable.astype(jnp.float32)
+        info = state.info | {
+            "terminated": terminated,
+            "truncated": truncated.astype(jnp.float32),
+            "is_reachable": reached,
+        }
+        metrics = state.metrics | {"similarity": similarity, "unreachable": 1.0 - reached}
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
+            pipeline_state=episode, obs=observe(episode), reward=reward, done=terminated, metrics=metrics, info=info
+        )
+
+    def map_reach(self, key: Array) -> ReachabilityMap:
+        """Returns the reachability map of the config's arm, mount and object."""
+        return reachability_map(self.arm, self.center, self.scene.radius, self.config.ik, key)
+
+    def solve(self, view: View, qpos: Array) -> tuple[Array, Array]:
+        """Returns joints f32[nq] for `view`, of those found the nearest to `qpos` (f32[nq]), and bool[] is_reachable."""
+        result, is_reachable = solve_view(
+            self.arm, self.reach, view, qpos, (self.center, self.scene.radius), self.config.ik
+        )
+        return result.qpos, is_reachable
+
+    def sample_pose(self, key: Array) -> tuple[View, Array]:
+        """Returns a random reachable view, uniform in azimuth and elevation over the band, and joints f32[nq] for it.
+
+        The arm's configuration varies: of the solutions found it is the one nearest to random joints.
+        Where IK fails between the cells of the map, the view of the nearest reachable cell is returned.
+        """
+        azimuth_key, elevation_key, joints_key = jax.random.split(key, 3)
+        azimuth = jax.random.uniform(azimuth_key, minval=-jnp.pi, maxval=jnp.pi)
+        elevation = jax.random.uniform(elevation_key, minval=self.reach.band[0], maxval=self.reach.band[1])
+        view = View(azimuth, elevation)
+        qpos, is_reachable = self.solve(view, self.random_joints(joints_key))
+        cell = nearest_cell(self.reach, view)
+        cell_view = View(self.reach.azimuths[cell[0]], self.reach.elevations[cell[1]])
+        view = jax.tree.map(lambda a, b: jnp.where(is_reachable, a, b), view, cell_view)
+        return view, jnp.where(is_reachable, qpos, self.reach.qpos[cell])
+
+    def random_joints(self, key: Array) -> Array:
+        """Returns f32[nq], the joints that move the camera uniform inside their limits, the others at home."""
+        lower, upper = start_limits(self.arm)
+        address = self.arm.chain.address
+        joints = lower + (upper - lower) * jax.random.uniform(key, lower.shape)
+        return self.arm.home.at[address].set(joints[address])
+
+    def random_sight(self, key: Array) -> Sight:
+        """Returns what is seen from a random reachable view."""
+        view, qpos = self.sample_pose(key)
+        return self.see(view, qpos)
+
+    def look(self, view: View, qpos: Array) -> tuple[Sight, Array]:
+        """Returns what is seen from `view` when the arm comes from joints `qpos` (f32[nq]), and bool[] is_reachable."""
+        joints, is_reachable = self.solve(view, qpos)
+        return self.see(view, joints), is_reachable
+
+    def see(self, view: View, qpos: Array) -> Sight:
+        """Returns what the wrist camera sees with the arm at joints `qpos` (f32[nq]); `view` is only noted."""
+        camera, latent = self.raw_look(qpos)
+        return Sight(view=view, qpos=qpos, camera=camera, code=encoders.code_of(self.encoder, latent))
+
+    def raw_look(self, qpos: Array) -> tuple[Camera, Array]:
+        """Returns the wrist camera and the raw latent f32[Z] of its picture with the arm at joints `qpos` (f32[nq])."""
+        camera, image = self.picture(qpos)
+        pixels = encoders.network_input(image, jnp.asarray(self.scene.object_geom_ids), self.config)
+        return camera, encoders.raw_latent(self.encoder.params, pixels, self.config)
+
+    def picture(self, qpos: Array) -> tuple[Camera, Image]:
+        """Returns the wrist camera and its picture with the arm at joints `qpos` (f32[nq])."""
+        data, camera = self.stand(qpos)
+        size = (self.config.scene.image_size, self.config.scene.image_size)
+        return camera, render.render(self.render_scene, data, camera, size)
+
+    def stand(self, qpos: Array) -> tuple[Any, Camera]:
+        """Returns MJX data of the arm at joints `qpos` (f32[nq]) and its wrist camera."""
+        data = forward_kinematics(self.arm, qpos)
+        return data, render.camera_from_pose(camera_pose(self.arm, data), self.fovy)
+
+
+def observe(episode: EpisodeState) -> Array:
+    """Returns the observation: code, target code, joints."""
+    return jnp.concatenate([episode.sight.code, episode.target.code, episode.sight.qpos])
+
+
+def pose_error(camera: Camera, target: Camera) -> tuple[Array, Array, Array]:
+    """Returns rotation error in rad, formula 3.2 of the thesis in rad, and translation error in m."""
+    translation = jnp.sqrt(jnp.sum((camera.position - target.position) ** 2, axis=-1))
+    rotations = (camera.rotation, target.rotation)
+    return rotation_error(*rotations), frobenius_angle(*rotations), translation

@@ -1,0 +1,73 @@
+"""The metrics of a run on disk: metrics.jsonl and TensorBoard's events; after a resume each iteration is there once."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tensorboardX import SummaryWriter
+
+from vsearch_jax.run_folder import EVENTS, METRICS, write_text
+
+STAGES = ("encoder", "policy")
+"""Names of the values of the metric `stage`."""
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """Returns the complete lines of `metrics.jsonl`, one dict an iteration; empty where there are none."""
+    path = run / METRICS
+    if not path.is_file():
+        return []
+    text = path.read_text(encoding="utf-8")
+    whole = text[: text.rfind("\n") + 1]  # a killed write leaves a last line without its end
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+class MetricsLog:
+    """Appends metrics to `metrics.jsonl` and to TensorBoard's events.
+
+    Attributes:
+      lines: every line of `metrics.jsonl`: `iteration`, `stage`, `seconds` (wall time) and the stage's metrics.
+    """
+
+    def __init__(self, run: Path, step: int) -> None:
+        """Opens the logs in the folder `run` to go on at iteration `step`; what they hold of later ones is dropped."""
+        self.lines = [line for line in read_metrics(run) if line["iteration"] < step]
+        self._path = run / METRICS
+        write_text(self._path, "".join(json.dumps(line) + "\n" for line in self.lines))
+        self._events = SummaryWriter(str(run / EVENTS), purge_step=step)
+
+    def append(self, metrics: Mapping[str, np.ndarray], first: int, seconds: float) -> None:
+        """Appends one line for each iteration of a chunk and returns when they are on disk.
+
+        Args:
+          metrics: `stage` i32[n] (place in `STAGES`) and f32[n] under each other name, NaN where the stage lacks it.
+          first: number of the chunk's first iteration.
+          seconds: wall time of the chunk.
+        """
+        stages = metrics["stage"]
+        new = []
+        for i, stage in enumerate(stages):
+            line: dict[str, Any] = {"iteration": first + i, "stage": STAGES[stage], "seconds": seconds / len(stages)}
+            values = {name: float(column[i]) for name, column in metrics.items() if name != "stage"}
+            # JSON has no NaN.
+            line |= {name: value for name, value in values.items() if math.isfinite(value)}
+            new.append(line)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write("".join(json.dumps(line) + "\n" for line in new))
+            file.flush()
+            os.fsync(file.fileno())
+        for line in new:
+            for name in line.keys() - {"iteration", "stage"}:
+                self._events.add_scalar(f"{line['stage']}/{name}", line[name], line["iteration"])
+        self._events.flush()
+        self.lines += new
+
+    def close(self) -> None:
+        """Closes TensorBoard's events."""
+        self._events.close()

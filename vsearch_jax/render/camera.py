@@ -1,0 +1,67 @@
+"""Cameras, and the rays of their pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+from jax import Array
+from jaxlie import SE3
+
+from vsearch_jax.render.scene import RenderError
+from vsearch_jax.types import Camera
+
+
+def camera(data: Any, mj_model: mujoco.MjModel, name: str) -> Camera:
+    """Returns the model's camera `name` where `data` puts it.
+
+    Args:
+      data: mjx.Data, or anything with cam_xpos f32[ncam, 3] m and cam_xmat f32[ncam, 3, 3], camera to world.
+      mj_model: the model of `data`; gives the field of view.
+      name: the camera's name.
+
+    Raises:
+      RenderError: the model has no camera of that name.
+    """
+    camera_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+    if camera_id < 0:
+        names = ", ".join(mj_model.cam(i).name for i in range(mj_model.ncam)) or "none"
+        raise RenderError(f"the model has no camera {name!r}; it has: {names}")
+    fovy = jnp.deg2rad(jnp.float32(mj_model.cam_fovy[camera_id]))
+    rotation = jnp.asarray(data.cam_xmat[camera_id], dtype=jnp.float32).reshape(3, 3)
+    return Camera(position=jnp.asarray(data.cam_xpos[camera_id], dtype=jnp.float32), rotation=rotation, fovy=fovy)
+
+
+def camera_from_pose(T_world_camera: SE3, fovy: Array | float) -> Camera:
+    """Returns the camera at a pose.
+
+    Args:
+      T_world_camera: pose of the camera, which looks along its own -z with +y up.
+      fovy: f32[] rad, vertical field of view.
+    """
+    return Camera(
+        position=T_world_camera.translation(),
+        rotation=T_world_camera.rotation().as_matrix(),
+        fovy=jnp.asarray(fovy, dtype=jnp.float32),
+    )
+
+
+def pixel_rays(fovy: Array, size: tuple[int, int]) -> tuple[Array, Array]:
+    """Returns the slopes of the rays through the pixels' centres.
+
+    The ray of pixel (row, column) runs along (x, y, -1) in the camera's frame, so a distance along it, in units of that
+    vector, is a depth along the optical axis. Pixels are square.
+
+    Args:
+      fovy: f32[] rad.
+      size: height and width in pixels.
+
+    Returns:
+      x of each column, f32[1, W], and y of each row, f32[H, 1].
+    """
+    height, width = size
+    scale = 2.0 * jnp.tan(0.5 * fovy) / height
+    columns = jnp.arange(width, dtype=jnp.float32) - 0.5 * (width - 1)
+    rows = 0.5 * (height - 1) - jnp.arange(height, dtype=jnp.float32)
+    return (scale * columns)[None, :], (scale * rows)[:, None]

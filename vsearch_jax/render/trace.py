@@ -1,0 +1,216 @@
+"""Which geom each pixel sees, and which pixels a light reaches.
+
+Both passes run through the geoms one by one, type by type, in loops that hold one small program a type. A loop visits
+only the geoms that can matter to the image, so its length is found at run time; under `vmap` it is that of the image
+with the most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from mujoco import mjtGeom
+
+from vsearch_jax.render.rays import CHORD_FUNCTIONS, RAY_FUNCTIONS, Vector, dot
+from vsearch_jax.render.scene import RenderScene
+
+_INFINITY_BITS = 0x7F800000
+
+
+class Frames(NamedTuple):
+    """Where the geoms are as the camera sees them; G is the number of visible geoms.
+
+    Attributes:
+      rotation: f32[G, 3, 3], camera to geom.
+      origin: f32[G, 3] m, the camera's position in the geom's frame.
+      center: f32[G, 3] m, the geom's position in the camera's frame.
+      radius: f32[G] m, of the sphere around `center` that holds the geom; +inf for planes.
+    """
+
+    rotation: Array
+    origin: Array
+    center: Array
+    radius: Array
+
+
+class Hits(NamedTuple):
+    """The nearest geom of each pixel.
+
+    Attributes:
+      slot: i32[H, W], row of the geom in the scene; 0 on a miss.
+      depth: f32[H, W] m, up to `depth_error`; 1 on a miss.
+      is_hit: bool[H, W].
+    """
+
+    slot: Array
+    depth: Array
+    is_hit: Array
+
+
+def type_starts(scene: RenderScene) -> tuple[tuple[int, int], ...]:
+    """Returns each geom type of the scene with its first row."""
+    return tuple((kind, scene.geom_types.index(kind)) for kind in sorted(set(scene.geom_types)))
+
+
+def bounding_radius(scene: RenderScene) -> Array:
+    """Returns f32[G] m: radii of spheres around the geoms; +inf for planes."""
+    x, y, z = scene.size[:, 0], scene.size[:, 1], scene.size[:, 2]
+    radii = {
+        "mjGEOM_PLANE": jnp.full_like(x, jnp.inf),
+        "mjGEOM_SPHERE": x,
+        "mjGEOM_CAPSULE": x + y,
+        "mjGEOM_ELLIPSOID": jnp.maximum(jnp.maximum(x, y), z),
+        "mjGEOM_CYLINDER": jnp.sqrt(x * x + y * y),
+        "mjGEOM_BOX": jnp.sqrt(x * x + y * y + z * z),
+    }
+    return jnp.stack([radii[mjtGeom(kind).name][row] for row, kind in enumerate(scene.geom_types)])
+
+
+def apply(rotation: Array, vector: Vector, offset: Array | None = None) -> Vector:
+    """Returns the triple `rotation @ vector + offset`; `rotation` f32[3, 3], `offset` f32[3]."""
+    rows = [rotation[i, 0] * vector[0] + rotation[i, 1] * vector[1] + rotation[i, 2] * vector[2] for i in range(3)]
+    if offset is not None:
+        rows = [row + offset[i] for i, row in enumerate(rows)]
+    return rows[0], rows[1], rows[2]
+
+
+def _triple(vector: Array) -> Vector:
+    return vector[0], vector[1], vector[2]
+
+
+def _minimum_over_geoms(
+    scene: RenderScene, is_kept: Array, value: Callable[[int, Array], Array], initial: Array
+) -> Array:
+    """Returns the pixelwise minimum of `initial` and `value(type, row)` over the rows where `is_kept`."""
+    best, starts = initial, type_starts(scene)
+    stops = [start for _, start in starts[1:]] + [len(scene.geom_types)]
+    for (kind, start), stop in zip(starts, stops, strict=True):
+        rank = jnp.cumsum(is_kept[start:stop])
+
+        def visit(state: tuple[Array, Array], kind: int = kind, start: int = start, rank: Array = rank):
+            count, best = state
+            row = start + jnp.argmax(rank == count + 1)
+            return count + 1, jnp.minimum(best, value(kind, row))
+
+        def is_left(state: tuple[Array, Array], rank: Array = rank):
+            return state[0] < rank[-1]
+
+        _, best = jax.lax.while_loop(is_left, visit, (jnp.zeros((), rank.dtype), best))
+    return best
+
+
+def _in_view(frames: Frames, x: Array, y: Array) -> Array:
+    """Returns bool[G]: the geom's bounding sphere reaches into the pyramid that the pixels see."""
+    depth = -frames.center[:, 2]
+    is_kept = depth > -frames.radius
+    for axis, slopes in ((0, x), (1, y)):
+        slope = jnp.max(jnp.abs(slopes))
+        outside = jnp.abs(frames.center[:, axis]) - slope * depth
+        is_kept &= outside < frames.radius * jnp.sqrt(1.0 + slope * slope)
+    return is_kept
+
+
+def nearest(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
+    """Returns the nearest geom of each pixel.
+
+    The row number stands in the low bits of the depth's bit pattern, which order as the depths do: one minimum finds both.
+
+    Args:
+      scene: shapes.
+      frames: Frames.
+      x: f32[1, W], slopes of the pixels' rays.
+      y: f32[H, 1].
+    """
+    mask = (1 << max(1, (len(scene.geom_types) - 1).bit_length())) - 1
+    ray = (x, y, -jnp.ones_like(x))
+
+    def packed_depth(kind: int, row: Array) -> Array:
+        direction = apply(frames.rotation[row], ray)
+        depth = RAY_FUNCTIONS[kind](_triple(scene.size[row]), _triple(frames.origin[row]), direction)
+        return (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | row.astype(jnp.int32)
+
+    initial = jnp.full((y.shape[0], x.shape[1]), _INFINITY_BITS, dtype=jnp.int32)
+    packed = _minimum_over_geoms(scene, _in_view(frames, x, y), packed_depth, initial)
+    is_hit = packed < _INFINITY_BITS
+    depth = jax.lax.bitcast_convert_type(packed & ~mask, jnp.float32)
+    return Hits(jnp.where(is_hit, packed & mask, 0), jnp.where(is_hit, depth, 1.0), is_hit)
+
+
+def _between(frames: Frames, hits: Hits, x: Array, y: Array, to_light: Array, distance: Array | float) -> Array:
+    """Returns bool[G]: the geom's bounding sphere reaches into the hull of all hit points and the light.
+
+    Args:
+      frames: Frames.
+      hits: Hits.
+      x: f32[1, W], slopes of the pixels' rays.
+      y: f32[H, 1].
+      to_light: f32[3], from the camera towards the light: a unit vector where `distance` is +inf, else the way in m.
+      distance: 1, or +inf for a light at infinity.
+    """
+    near = jnp.min(jnp.where(hits.is_hit, hits.depth, jnp.inf))
+    far = jnp.max(jnp.where(hits.is_hit, hits.depth, -jnp.inf))
+    # The hit points lie in a frustum from `near` to `far`; this sphere around a point of the axis holds it.
+    near, far = jnp.where(near < far, near, 1.0), jnp.where(near < far, far, 1.0)
+    middle = 0.5 * (near + far)
+    radius = jnp.sqrt((far - middle) ** 2 + far * far * (jnp.max(jnp.abs(x)) ** 2 + jnp.max(jnp.abs(y)) ** 2))
+    sphere = jnp.stack([jnp.zeros_like(middle), jnp.zeros_like(middle), -middle])
+    way = to_light if distance == jnp.inf else to_light - sphere
+    offset = frames.center - sphere
+    along = jnp.clip(offset @ way / jnp.maximum(way @ way, 1e-20), 0.0, distance)
+    gap = offset - along[:, None] * way
+    reach = frames.radius + radius
+    return jnp.sum(gap * gap, axis=-1) <= reach * reach
+
+
+def lit_by_directional(
+    scene: RenderScene, frames: Frames, hits: Hits, rays: tuple[Array, Array], to_light: Array
+) -> Array:
+    """Returns f32[H, W]: 0 where a geom stands between the pixel's surface and a light at infinity, else 1.
+
+    A geom is convex, so it never shades the part of itself that faces the light: its own row is passed over, and a
+    surface needs no bias against itself.
+
+    Args:
+      scene: shapes.
+      frames: Frames.
+      hits: Hits.
+      rays: slopes of the pixels' rays, f32[1, W] and f32[H, 1].
+      to_light: f32[3], unit vector towards the light in the camera's frame.
+    """
+    x, y = rays
+    point = (x * hits.depth, y * hits.depth, -hits.depth)
+
+    def is_clear(kind: int, row: Array) -> Array:
+        start = apply(frames.rotation[row], point, frames.origin[row])
+        direction = apply(frames.rotation[row], _triple(to_light))
+        chord = CHORD_FUNCTIONS[kind](_triple(scene.size[row]), start, direction)
+        is_blocked = (chord > scene.shadow_offset) & (chord < jnp.inf) & (hits.slot != row)
+        return jnp.where(is_blocked, 0.0, 1.0)
+
+    is_kept = _between(frames, hits, x, y, to_light, jnp.inf)
+    return _minimum_over_geoms(scene, is_kept, is_clear, jnp.ones_like(hits.depth))
+
+
+def lit_by_positional(
+    scene: RenderScene, frames: Frames, hits: Hits, rays: tuple[Array, Array], light: Array
+) -> Array:
+    """Returns f32[H, W]: as `lit_by_directional`, for a light at f32[3] m in the camera's frame.
+
+    The rays start at the light, which they share, so that what depends on their origin is computed once.
+    """
+    x, y = rays
+    way = (x * hits.depth - light[0], y * hits.depth - light[1], -hits.depth - light[2])
+    limit = 1.0 - scene.shadow_offset / jnp.sqrt(jnp.maximum(dot(way, way), 1e-12))
+
+    def is_clear(kind: int, row: Array) -> Array:
+        start = apply(frames.rotation[row], _triple(light), frames.origin[row])
+        direction = apply(frames.rotation[row], way)
+        chord = CHORD_FUNCTIONS[kind](_triple(scene.size[row]), start, direction)
+        return jnp.where((chord > 0.0) & (chord < limit) & (hits.slot != row), 0.0, 1.0)
+
+    is_kept = _between(frames, hits, x, y, light, 1.0)
+    return _minimum_over_geoms(scene, is_kept, is_clear, jnp.ones_like(hits.depth))

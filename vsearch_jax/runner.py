@@ -1,0 +1,142 @@
+"""A run from start to report: the host's loop of equal chunks, saving and reporting between them.
+
+After each chunk its metrics go to the disk first, then the checkpoint; whatever kills the run in between, the run goes
+on from the last checkpoint, and metrics past it are dropped. So the run needs no care at an interrupt.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from vsearch_jax import checkpoint, report, run_folder
+from vsearch_jax.config import Config
+from vsearch_jax.evaluation import evaluate
+from vsearch_jax.metrics_log import STAGES, MetricsLog, read_metrics
+from vsearch_jax.run_folder import RunError
+from vsearch_jax.training import init, train
+from vsearch_jax.types import TrainState
+
+T = TypeVar("T")
+
+
+def start(run: Path, config: Config, seed: int) -> TrainState:
+    """Makes the folder `run` and returns the state at the start, saved there as the checkpoint of step 0.
+
+    If that fails the folder is left empty.
+
+    Raises:
+      RunError: the folder exists and holds something.
+      ConfigError, SceneError: the config can't be run.
+      OSError: the disk is full or not writable.
+    """
+    with run_folder.claimed(run):
+        state = in_thread(init, jax.random.key(seed), config)
+        run_folder.write_config(run, config)
+        checkpoint.save(run, state, config)
+    return state
+
+
+def resume(run: Path, config: Config) -> TrainState:
+    """Returns the state of the last checkpoint in the folder `run`.
+
+    Raises:
+      RunError: there is no run in the folder.
+      CheckpointError: the checkpoint is missing, damaged or of another config.
+    """
+    saved = run_folder.read_config(run)
+    template = jax.eval_shape(lambda key: init(key, config), jax.random.key(0))
+    state = checkpoint.restore(run, template, config)
+    if saved != config:  # in what only evaluation reads
+        run_folder.write_config(run, config)
+    return state
+
+
+OnChunk = Callable[[int, float, Sequence[Mapping[str, Any]]], None]
+"""Takes iterations done, the chunk's wall time in s and its lines of metrics.jsonl."""
+
+
+def finish_training(run: Path, state: TrainState, config: Config, on_chunk: OnChunk) -> TrainState:
+    """Trains from `state` to the end of the run, saving after each chunk.
+
+    Args:
+      run: the run's folder.
+      state: from `start` or `resume`; donated.
+      config: the run's config.
+      on_chunk: called after each chunk is saved.
+
+    Raises:
+      OSError: the disk is full or not writable; the last checkpoint stays.
+    """
+    step = int(state.step)
+    log = MetricsLog(run, step)
+    while step < config.num_iterations:
+        began = time.perf_counter()
+        state, metrics = in_thread(train, state, config)
+        seconds = time.perf_counter() - began
+        new_step = int(state.step)
+        # The last chunk may be shorter than its arrays.
+        columns = {name: np.asarray(column)[: new_step - step] for name, column in metrics.items()}
+        log.append(columns, step, seconds)
+        checkpoint.save(run, state, config)
+        on_chunk(new_step, seconds, log.lines[step - new_step :])
+        step = new_step
+    log.close()
+    return state
+
+
+def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str, Any]:
+    """Evaluates a trained state and writes results.json, figures and report.html into the folder `run`.
+
+    Returns:
+      What `results.json` holds.
+
+    Raises:
+      RunError: the run is not finished.
+      ConfigError: the arm can't reach the target view.
+      OSError: the disk is full or not writable.
+    """
+    check_finished(run, state, config)
+    began = time.perf_counter()
+    arrays = in_thread(evaluate, state, config)
+    lines = read_metrics(run)
+    wall_seconds: dict[str, float] = {
+        stage: sum(line["seconds"] for line in lines if line["stage"] == stage) for stage in STAGES
+    }
+    wall_seconds["evaluation"] = time.perf_counter() - began
+    results = report.results(arrays, config, wall_seconds)
+    pictures = report.draw(results, arrays, state.reach, lines, config)
+    report.write(run, results, pictures, config)
+    return results
+
+
+def check_finished(run: Path, state: TrainState, config: Config) -> None:
+    """Raises RunError where the run in the folder `run`, its state given, has iterations left."""
+    step, end = int(state.step), config.num_iterations
+    if step < end:
+        raise RunError(f"{run} has done {step} of {end} iterations; finish it: vsearch train --out {run} --resume")
+
+
+def in_thread(function: Callable[..., T], *arguments: Any) -> T:
+    """Returns `function(*arguments)` with its arrays computed; unlike a plain call it can be interrupted at once.
+
+    A signal's handler runs in the main thread only, and there only between two steps of Python, while one call of a
+    compiled function may take hours. So the call is made in another thread, which an interrupt leaves behind.
+    """
+    future: concurrent.futures.Future[T] = concurrent.futures.Future()
+
+    def call() -> None:
+        try:
+            future.set_result(jax.block_until_ready(function(*arguments)))
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=call, daemon=True).start()
+    return future.result()

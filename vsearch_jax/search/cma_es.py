@@ -1,0 +1,146 @@
+"""CMA-ES over azimuth and elevation (SPEC.md 6), evosax's, with bounds and restarts.
+
+evosax 0.3.2 follows Hansen's tutorial (arXiv 1604.00772) with its parameters of 2016. Its generation counter is one
+ahead in the stall indicator h_sigma (tutorial, page 28), so states start at -1 here; with that it equals `cma` 4.5 to
+1e-5 when both use the same parameters.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from evosax.algorithms.distribution_based.cma_es import CMA_ES
+from jax import Array
+
+from vsearch_jax.config import CMAESConfig
+from vsearch_jax.geometry import wrap_angle
+from vsearch_jax.search.common import (
+    Record,
+    ScoreFn,
+    SearchArgs,
+    add_generation,
+    is_running,
+    start_record,
+    to_result,
+)
+from vsearch_jax.types import SearchResult, View
+
+# One unit of the search space is a quarter turn of azimuth and half the band's height of elevation.
+_AZIMUTH_UNIT = math.pi / 2.0
+_UNREACHABLE_FITNESS = 5.0  # above 1 - cosine, at most 2, by more than the bounds' penalty
+_BOUND_PENALTY = 1.0  # for each squared unit outside the band
+_SMALLEST_SIGMA = 0.05  # units, 4.5 deg of azimuth: about the basin of a threshold of 0.98
+_STALL_GENERATIONS = 4
+_STALL_IMPROVEMENT = 3e-3
+
+
+@flax.struct.dataclass
+class _Carry:
+    """State of the loop.
+
+    Attributes:
+      record: Record.
+      strategy: evosax's state.
+      run_fitness: f32[], best fitness since the last restart.
+      stalled: i32[], generations since that improved.
+    """
+
+    record: Record
+    strategy: Any
+    run_fitness: Array
+    stalled: Array
+
+
+def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: CMAESConfig) -> SearchResult:
+    """Searches the view sphere by CMA-ES that starts at the initial view and restarts where it gets stuck.
+
+    Azimuth is periodic, so it has no bounds. A sample whose elevation is outside the band is moved to its edge, and its
+    squared distance is added to the fitness 1 - cosine (Hansen's boundary handling, with a fixed weight). When the
+    largest axis has shrunk below 4.5 deg of azimuth, or four generations did not improve, the strategy restarts with
+    the initial step size at a random view, and the best view of all starts is kept. The search ends at the threshold
+    or after `config.max_generations`; if the initial view meets the threshold, after its one image.
+
+    Args:
+      key: PRNG key.
+      score_fn: maps (view, args.task) to the score, f32[]; -inf where unreachable. It is vmapped over the samples.
+      args: SearchArgs of one problem.
+      config: CMAESConfig; `sigma_deg` is the step size in azimuth; in elevation it is in proportion to the band.
+
+    Returns:
+      SearchResult with best_scores f32[config.max_generations].
+    """
+    sigma = math.radians(config.sigma_deg) / _AZIMUTH_UNIT
+    algorithm = CMA_ES(population_size=config.population, solution=jnp.zeros(2))
+    with _evosax_promotion():
+        params = algorithm.default_params.replace(std_init=jnp.asarray(sigma, jnp.float32))
+    carry = _Carry(
+        record=start_record(args.initial, score_fn(args.initial, args.task), config.max_generations),
+        strategy=_start(algorithm, params, _to_units(args.initial, args.band)),
+        run_fitness=jnp.float32(jnp.inf),
+        stalled=jnp.int32(0),
+    )
+    body = functools.partial(_generation, key, score_fn, args, (algorithm, params))
+    carry = jax.lax.while_loop(lambda carry: is_running(carry.record, args.threshold), body, carry)
+    return to_result(carry.record)
+
+
+def _generation(key: Array, score_fn: ScoreFn, args: SearchArgs, method: tuple[CMA_ES, Any], carry: _Carry) -> _Carry:
+    algorithm, params = method
+    sample_key, restart_key = jax.random.split(jax.random.fold_in(key, carry.record.generation))
+    with _evosax_promotion():
+        population, strategy = algorithm.ask(sample_key, carry.strategy, params)
+    views, excess = jax.vmap(_to_view, in_axes=(0, None))(population, args.band)
+    scores = jax.vmap(score_fn, in_axes=(0, None))(views, args.task)
+    fitness = jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2
+    with _evosax_promotion():
+        strategy, _ = algorithm.tell(sample_key, population, fitness, strategy, params)
+    best = jnp.min(fitness)
+    has_improved = best < carry.run_fitness - _STALL_IMPROVEMENT
+    stalled = jnp.where(has_improved, 0, carry.stalled + 1)
+    largest_sigma = strategy.std * jnp.sqrt(jnp.linalg.eigvalsh(strategy.C)[-1])
+    is_stuck = (stalled >= _STALL_GENERATIONS) | (largest_sigma < _SMALLEST_SIGMA)
+    mean = jax.random.uniform(restart_key, (2,), minval=jnp.array([-2.0, -1.0]), maxval=jnp.array([2.0, 1.0]))
+    fresh = _start(algorithm, params, mean)
+    return _Carry(
+        record=add_generation(carry.record, views, scores, args.threshold),
+        strategy=jax.tree.map(lambda a, b: jnp.where(is_stuck, a, b), fresh, strategy),
+        run_fitness=jnp.where(is_stuck, jnp.inf, jnp.minimum(best, carry.run_fitness)),
+        stalled=jnp.where(is_stuck, 0, stalled),
+    )
+
+
+@contextlib.contextmanager
+def _evosax_promotion() -> Iterator[None]:
+    """Lets evosax promote types and ranks, on which it relies, also where jax is told to be strict."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+def _start(algorithm: CMA_ES, params: Any, mean: Array) -> Any:
+    with _evosax_promotion():
+        strategy = algorithm.init(jax.random.key(0), mean, params)  # it draws nothing from the key
+    return strategy.replace(generation_counter=jnp.int32(-1))
+
+
+def _to_units(view: View, band: Array) -> Array:
+    """Returns f32[2], the point of the search space for `view`."""
+    middle, half = jnp.mean(band), _half_height(band)
+    return jnp.stack([view.azimuth / _AZIMUTH_UNIT, (view.elevation - middle) / half])
+
+
+def _to_view(point: Array, band: Array) -> tuple[View, Array]:
+    """Returns the view at or nearest to `point` (f32[2]) inside the band, and how many units outside the point is."""
+    inside = jnp.clip(point[1], -1.0, 1.0)
+    elevation = jnp.clip(jnp.mean(band) + inside * _half_height(band), band[0], band[1])
+    return View(azimuth=wrap_angle(point[0] * _AZIMUTH_UNIT), elevation=elevation), point[1] - inside
+
+
+def _half_height(band: Array) -> Array:
+    return jnp.maximum(0.5 * (band[1] - band[0]), 1e-6)  # a band of one elevation keeps the division finite

@@ -1,0 +1,19 @@
+"""Soft actor-critic with goal relabelling: networks, update, replay and the roll-out of the policy."""
+
+from vsearch_jax.search.sac.agent import act, init, td_target, update
+from vsearch_jax.search.sac.relabel import relabel
+from vsearch_jax.search.sac.replay import ReplayState, init_replay, insert, sample
+from vsearch_jax.search.sac.rollout import search
+
+__all__ = [
+    "ReplayState",
+    "act",
+    "init",
+    "init_replay",
+    "insert",
+    "relabel",
+    "sample",
+    "search",
+    "td_target",
+    "update",
+]

@@ -1,0 +1,56 @@
+"""Goal relabelling (hindsight experience replay, Andrychowicz et al. 2017, arXiv 1707.01495)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from vsearch_jax.config import EnvConfig, SACConfig
+from vsearch_jax.geometry import cosine_similarity
+from vsearch_jax.types import Transition
+
+
+def relabel(
+    key: Array, transitions: Transition, candidate_codes: Array, env_config: EnvConfig, config: SACConfig
+) -> Transition:
+    """Replaces the target of a part of the batch and recomputes what follows from it.
+
+    Of the fraction `config.relabel_fraction`, two thirds get a random one of `candidate_codes` and a third the code to
+    which their own step led, which makes that step a success. Reward and `terminated` of every transition are
+    recomputed from the codes; a step that the arm could not do keeps `unreachable_reward` and never terminates, as in
+    the environment, and is not relabelled with its own code: it is no way to a target.
+
+    Args:
+      key: PRNG key.
+      transitions: Transition with a leading batch axis; observations are code ‖ target code ‖ joints.
+      candidate_codes: f32[N, Z], codes of reachable views.
+      env_config: threshold and rewards.
+      config: SACConfig.
+    """
+    num, size = transitions.reward.shape[0], candidate_codes.shape[-1]
+    choice_key, candidate_key = jax.random.split(key)
+    choice = jax.random.uniform(choice_key, (num,))
+    candidate = candidate_codes[jax.random.randint(candidate_key, (num,), 0, candidate_codes.shape[0])]
+    next_code = transitions.next_observation[:, :size]
+    is_reachable = transitions.is_reachable > 0.5
+    is_own = (choice < config.relabel_fraction / 3.0) & is_reachable
+    is_other = choice < config.relabel_fraction
+    target = transitions.observation[:, size : 2 * size]
+    target = jnp.where(is_own[:, None], next_code, jnp.where(is_other[:, None], candidate, target))
+
+    similarity = cosine_similarity(next_code, target)
+    is_found = is_reachable & (similarity >= env_config.threshold)
+    reward = jnp.where(is_found, env_config.success_reward, similarity - 1.0)
+    return transitions._replace(
+        observation=_with_target(transitions.observation, target),
+        next_observation=_with_target(transitions.next_observation, target),
+        reward=jnp.where(is_reachable, reward, env_config.unreachable_reward),
+        terminated=is_found.astype(transitions.terminated.dtype),
+        truncated=jnp.where(is_found, 0.0, transitions.truncated),
+    )
+
+
+def _with_target(observation: Array, target: Array) -> Array:
+    size = target.shape[-1]
+    return jnp.concatenate([observation[:, :size], target, observation[:, 2 * size :]], axis=-1)

@@ -1,0 +1,226 @@
+"""Pytrees that cross a module's border.
+
+Every class here is written for one item. Batch axes come from `jax.vmap` and lead.
+Frames: `world` is MuJoCo's world frame (z up); a camera looks along its own -z with +y up.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+from jax import Array
+
+
+class View(NamedTuple):
+    """A camera pose on the view sphere: the camera looks at the sphere's centre, image upright.
+
+    Attributes:
+      azimuth: f32[] rad, about world z, 0 along world +x.
+      elevation: f32[] rad above the table plane.
+    """
+
+    azimuth: Array
+    elevation: Array
+
+
+@flax.struct.dataclass
+class Camera:
+    """A pinhole camera.
+
+    Attributes:
+      position: f32[3] m, of the optical centre in world.
+      rotation: f32[3, 3], camera to world; columns are the camera's x, y, z axes; it looks along -z.
+      fovy: f32[] rad, vertical field of view.
+    """
+
+    position: Array
+    rotation: Array
+    fovy: Array
+
+
+@flax.struct.dataclass
+class Image:
+    """What a camera sees; row 0 is the top of the image.
+
+    Attributes:
+      rgb: f32[H, W, 3] in [0, 1].
+      depth: f32[H, W] m along the optical axis, +inf on a miss.
+      geom_id: i32[H, W], MuJoCo's geom number, -1 on a miss.
+    """
+
+    rgb: Array
+    depth: Array
+    geom_id: Array
+
+
+@flax.struct.dataclass
+class IKResult:
+    """The outcome of one inverse-kinematics problem.
+
+    Attributes:
+      qpos: f32[nq] rad or m; inside the joint limits.
+      position_error: f32[] m.
+      rotation_error: f32[] rad, geodesic.
+      is_converged: bool[], both errors are within the tolerances of the config.
+    """
+
+    qpos: Array
+    position_error: Array
+    rotation_error: Array
+    is_converged: Array
+
+
+@flax.struct.dataclass
+class ReachabilityMap:
+    """Which views of a grid the arm can reach, and with which joints.
+
+    Attributes:
+      azimuths: f32[A] rad, periodic and evenly spaced from 0.
+      elevations: f32[E] rad, evenly spaced and rising.
+      is_reachable: bool[A, E]: IK converges inside the limits without contact.
+      qpos: f32[A, E, nq], the best joints found for the view of each cell.
+      band: f32[2] rad, lowest and highest elevation of the widest run that is reachable at every azimuth.
+    """
+
+    azimuths: Array
+    elevations: Array
+    is_reachable: Array
+    qpos: Array
+    band: Array
+
+
+@flax.struct.dataclass
+class Sight:
+    """What the wrist camera sees from where the arm stands.
+
+    Attributes:
+      view: View that was commanded.
+      qpos: f32[nq], joints that hold the camera there.
+      camera: Camera, where these joints truly put it: within IK's tolerance of the view.
+      code: f32[Z], encoding of the picture.
+    """
+
+    view: View
+    qpos: Array
+    camera: Camera
+    code: Array
+
+
+@flax.struct.dataclass
+class EpisodeState:
+    """The view-search environment between two steps.
+
+    Attributes:
+      sight: Sight of the present view.
+      target: Sight of the view that is looked for.
+      num_steps: i32[], steps done in the episode.
+    """
+
+    sight: Sight
+    target: Sight
+    num_steps: Array
+
+
+class Transition(NamedTuple):
+    """One step of a view-search episode, as the replay keeps it.
+
+    Attributes:
+      observation: f32[265].
+      action: f32[2] in [-1, 1].
+      reward: f32[].
+      next_observation: f32[265], of the state before any reset.
+      terminated: f32[], 1 where the episode ended at the threshold: no value follows.
+      truncated: f32[], 1 where the episode ran out of steps: the value goes on.
+      is_reachable: f32[], 1 where the arm could do the step; 0 where it stayed and `unreachable_reward` was paid.
+    """
+
+    observation: Array
+    action: Array
+    reward: Array
+    next_observation: Array
+    terminated: Array
+    truncated: Array
+    is_reachable: Array
+
+
+@flax.struct.dataclass
+class SACState:
+    """Parameters and optimizer states of soft actor-critic.
+
+    Attributes:
+      actor: parameters of the policy.
+      critic: parameters of the twin Q networks, leading axis 2.
+      target_critic: moving average of `critic`, leading axis 2.
+      log_alpha: f32[], logarithm of the temperature.
+      opt_states: optax states of actor, critic and log_alpha, in this order.
+    """
+
+    actor: Any
+    critic: Any
+    target_critic: Any
+    log_alpha: Array
+    opt_states: tuple[Any, Any, Any]
+
+
+@flax.struct.dataclass
+class EncoderState:
+    """The augmented autoencoder and what turns its raw latent into a code.
+
+    Attributes:
+      params: parameters of encoder and decoder (nnx state split to a pytree).
+      opt_state: optax state of `params`.
+      latent_mean: f32[Z], mean raw latent over the reachable views.
+      whitening: f32[Z, Z], symmetric partial whitening matrix of the mean-free raw latent.
+    """
+
+    params: Any
+    opt_state: Any
+    latent_mean: Array
+    whitening: Array
+
+
+@flax.struct.dataclass
+class TrainState:
+    """Everything a run needs to go on; S is the number of policy seeds.
+
+    Attributes:
+      encoder: EncoderState.
+      reach: ReachabilityMap of the arm, mount and object.
+      pool: Sight of f32[N, ...]: random reachable views, seen once, from which training episodes start;
+        zeros until the encoder is done.
+      sac: SACState, leading axis S.
+      env: brax State of the training environments, leading axes S, num_envs.
+      replay: replay buffer state, leading axis S.
+      key: PRNG key from which every later random number of the run is folded.
+      step: i32[], iterations done, encoder updates first and policy iterations after them.
+    """
+
+    encoder: EncoderState
+    reach: ReachabilityMap
+    pool: Sight
+    sac: SACState
+    env: Any
+    replay: Any
+    key: jax.Array
+    step: Array
+
+
+@flax.struct.dataclass
+class SearchResult:
+    """What one search found; G is the most generations (epochs, steps) that the config allows.
+
+    Attributes:
+      view: View, the best view seen.
+      score: f32[], its score.
+      best_scores: f32[G], best score so far after each generation; the last value repeats after the end.
+      evaluations: i32[], images taken until the threshold was met, all of them if it was not.
+      unreachable: i32[], how many of these the arm could not reach.
+    """
+
+    view: View
+    score: Array
+    best_scores: Array
+    evaluations: Array
+    unreachable: Array
