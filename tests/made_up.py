@@ -37,6 +37,12 @@ def evaluation(num_seeds: int = 1) -> dict[str, Any]:
     return {"random_search": trials((12,), 30), "cma_es": trials((12,), 30, 1), "sac": trials(shape, 20) | steps}
 
 
+def search() -> dict[str, Any]:
+    """What `record_search` could have returned: two steps to the threshold."""
+    images = np.random.default_rng(2).random((21, 16, 16, 3)).astype(np.float32)
+    return {"images": images, "similarity": np.linspace(0.1, 1.0, 21), "target": images[2], "num_steps": np.int32(2)}
+
+
 def reach() -> ReachabilityMap:
     """A map whose reachable cells are those of the band."""
     elevations = jnp.linspace(0, jnp.pi / 2, 7)

@@ -8,9 +8,7 @@ import mujoco
 import numpy as np
 from mujoco import mjtGeom
 
-SOLIDS = tuple(
-    getattr(mjtGeom, f"mjGEOM_{name}") for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
-)
+SOLIDS = tuple(getattr(mjtGeom, f"mjGEOM_{name}") for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"))
 
 
 class Poses(NamedTuple):
@@ -49,7 +47,9 @@ def random_scene(rng: np.random.Generator, num_geoms: int = 20, plane: bool = Tr
     eye = rng.normal(size=3)
     eye *= rng.uniform(1.0, 2.0) / np.linalg.norm(eye)
     eye[2] = abs(eye[2])
-    world.add_camera(name="eye", pos=eye, quat=look_at(eye, rng.uniform(-0.2, 0.2, size=3)), fovy=rng.uniform(30.0, 70.0))
+    world.add_camera(
+        name="eye", pos=eye, quat=look_at(eye, rng.uniform(-0.2, 0.2, size=3)), fovy=rng.uniform(30.0, 70.0)
+    )
     return spec.compile()
 
 

@@ -1,4 +1,4 @@
-"""A made-up arm unlike the LWR: a slide, joints off their bodies' origins, boxes and a side branch that moves nothing."""
+"""A made-up arm unlike the LWR: a slide, joints off their bodies' origins, boxes, a branch beside the camera."""
 
 MJCF = """
 <mujoco model="second">

@@ -1,4 +1,4 @@
-"""A run without scene and networks, in place of `init`, `train` and `evaluate`: what is tested is the loop around them.
+"""A run without scene and networks, in place of `init`, `train`, `evaluate` and `record_search`: what is tested is the loop around them.
 
 As a program it is the `vsearch` command over that run: `python standin.py train --preset smoke --out DIR`.
 """
@@ -10,8 +10,8 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-import made_up
 
+import made_up
 from vsearch_jax import runner
 from vsearch_jax.cli import main
 from vsearch_jax.config import Config
@@ -58,9 +58,13 @@ def evaluate(state: State, config: Config) -> dict[str, Any]:
     return made_up.evaluation(config.sac.num_seeds)
 
 
+def record_search(state: State, config: Config) -> dict[str, Any]:
+    return made_up.search()
+
+
 def install() -> None:
     """Puts the stand-in in the place of the real run."""
-    runner.init, runner.train, runner.evaluate = init, train, evaluate
+    runner.init, runner.train, runner.evaluate, runner.record_search = init, train, evaluate, record_search
 
 
 if __name__ == "__main__":

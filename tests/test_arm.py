@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mujoco import mjx
-from second_arm import MJCF
 
+from second_arm import MJCF
 from vsearch_jax import collision
 from vsearch_jax.arm import build_arm, camera_kinematics, camera_pose, clearance, forward_kinematics, is_free
 from vsearch_jax.config import SceneConfig
@@ -85,9 +85,8 @@ def test_kinematics_equal_mujoco(setup):
 def test_kinematics_equal_mjx(lwr):
     model, template = lwr.scene.mjx_model, lwr.arm.data
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # mjx promotes freely
-        lowered = jax.jit(lambda qpos: mjx.kinematics(model, template.replace(qpos=qpos))).lower(lwr.qpos[0])
-    # With fusion, XLA on CPU takes minutes for it: see vsearch_jax/arm.py.
-    data = lowered.compile(compiler_options={"xla_disable_hlo_passes": "fusion"})(lwr.qpos[0])
+        # One configuration: vmapped, mjx.kinematics takes minutes on CPU, see vsearch_jax/kinematics.py.
+        data = jax.jit(lambda qpos: mjx.kinematics(model, template.replace(qpos=qpos)))(lwr.qpos[0])
     for name in FIELDS[:-2]:  # mjx.kinematics places no cameras
         ours = lwr.fields[name][0]
         np.testing.assert_allclose(ours, np.reshape(getattr(data, name), ours.shape), atol=1e-5, err_msg=name)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
-import standin
 
+import standin
 from vsearch_jax import checkpoint, cli, runner
 from vsearch_jax.config import Config
 from vsearch_jax.metrics_log import STAGES, MetricsLog, read_metrics
@@ -25,7 +25,7 @@ STANDIN = str(ROOT / "tests" / "standin.py")
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stand-in for init, train and evaluate, without its pauses."""
-    for name in ("init", "train", "evaluate"):
+    for name in ("init", "train", "evaluate", "record_search"):
         monkeypatch.setattr(runner, name, getattr(standin, name))
     monkeypatch.setattr(standin, "CHUNK_SECONDS", 0.0)
 

@@ -21,64 +21,57 @@ def run(keys, args, score_fn, config) -> SearchResult:
     return jax.vmap(lambda key, args: cma_es.search(key, score_fn, args, config))(keys, args)
 
 
-def random_problems(num: int):
-    return probes.search_problems(
-        probes.random_views(jax.random.key(1), num), probes.random_views(jax.random.key(2), num)
-    )
+NUM = 240  # one number for all, so that one compilation serves several tests
+KEYS = jax.random.split(jax.random.key(0), NUM)
+START, TARGET = (probes.random_views(jax.random.key(seed), NUM) for seed in (1, 2))
 
 
 @pytest.fixture(scope="module")
 def result() -> SearchResult:
-    keys = jax.random.split(jax.random.key(0), 500)
-    return run(keys, random_problems(500), probes.unreachable_outside_band, CONFIG)
+    return run(KEYS, probes.search_problems(START, TARGET), probes.unreachable_outside_band, CONFIG)
 
 
 def test_finds_the_target_past_a_false_optimum_within_60_images(result):
     found = np.asarray(result.score) >= probes.THRESHOLD
     assert found.mean() >= 0.98
     assert np.asarray(result.evaluations).mean() <= 60
-    angles = jax.vmap(probes.angle_between)(result.view, random_problems(500).task)
-    assert np.rad2deg(np.asarray(angles)[found].max()) < 6.0
+    angles = jax.vmap(probes.angle_between)(result.view, TARGET)
+    assert np.rad2deg(np.asarray(angles)[found].max()) < 6.0  # 0.98 is met within 5.3 degrees
 
 
 def test_every_sample_lies_inside_the_band(result):
     assert int(result.unreachable.sum()) == 0
 
 
-def test_restarts_lead_out_of_the_false_optimum():
-    target = probes.random_views(jax.random.key(4), 300)
-    start = probes.opposite(target)
-    narrow = CMAESConfig(sigma_deg=20.0, max_generations=60)
-    keys = jax.random.split(jax.random.key(5), 300)
-    result = run(keys, probes.search_problems(start, target), probes.two_peaks, narrow)
-    assert (np.asarray(result.score) >= probes.THRESHOLD).mean() >= 0.98
-
-
 def test_azimuth_is_periodic():
     """Across the cut at 180 degrees the search is as short as anywhere else."""
-    num = 200
-    keys, elevation = jax.random.split(jax.random.key(6), num), jnp.full((num,), 1.0)
+    elevation = jnp.full((NUM,), 1.0)
     means = []
     for azimuth in (0.0, math.pi):
-        start = View(jnp.full((num,), azimuth - 0.4), elevation)
-        target = View(jnp.full((num,), -math.pi + 0.4 if azimuth else 0.4), elevation)
-        means.append(np.asarray(run(keys, probes.search_problems(start, target), probes.two_peaks, CONFIG).evaluations))
-    assert means[1].mean() == pytest.approx(means[0].mean(), rel=0.25)
+        start = View(jnp.full((NUM,), azimuth - 0.4), elevation)
+        target = View(jnp.full((NUM,), -math.pi + 0.4 if azimuth else 0.4), elevation)
+        problems = probes.search_problems(start, target)
+        means.append(np.asarray(run(KEYS, problems, probes.unreachable_outside_band, CONFIG).evaluations).mean())
+    assert means[1] == pytest.approx(means[0], rel=0.25)
 
 
 def test_a_start_at_the_target_costs_one_image():
-    views = probes.random_views(jax.random.key(3), 4)
-    result = run(
-        jax.random.split(jax.random.key(0), 4), probes.search_problems(views, views), probes.two_peaks, CONFIG
-    )
-    np.testing.assert_array_equal(result.evaluations, np.ones(4))
+    result = run(KEYS, probes.search_problems(TARGET, TARGET), probes.unreachable_outside_band, CONFIG)
+    np.testing.assert_array_equal(result.evaluations, np.ones(NUM))
+
+
+def test_restarts_lead_out_of_the_false_optimum():
+    start = probes.opposite(TARGET)
+    narrow = CMAESConfig(sigma_deg=20.0, max_generations=60)
+    result = run(KEYS, probes.search_problems(start, TARGET), probes.unreachable_outside_band, narrow)
+    assert (np.asarray(result.score) >= probes.THRESHOLD).mean() >= 0.98
 
 
 def test_where_nothing_is_reachable_the_search_goes_on_and_stays_finite():
     config = CMAESConfig(max_generations=12)
-    result = run(jax.random.split(jax.random.key(0), 3), random_problems(3), probes.never_reachable, config)
-    np.testing.assert_array_equal(result.evaluations, np.full(3, 121))
-    np.testing.assert_array_equal(result.unreachable, np.full(3, 121))
+    result = run(KEYS, probes.search_problems(START, TARGET), probes.never_reachable, config)
+    np.testing.assert_array_equal(result.evaluations, np.full(NUM, 121))
+    np.testing.assert_array_equal(result.unreachable, np.full(NUM, 121))
     assert np.isfinite(np.asarray(result.view.azimuth)).all()
 
 

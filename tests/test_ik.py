@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 from jaxlie import SE3
-from second_arm import MJCF
 
+from second_arm import MJCF
 from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import IKConfig, SceneConfig
 from vsearch_jax.geometry import view_pose
@@ -70,7 +70,7 @@ def _solve_all(arm, config):
 
     poses = jax.jit(jax.vmap(pose))(_random_joints(arm, 1, NUM_POSES))
     present = _random_joints(arm, 2, NUM_POSES)
-    result = jax.jit(jax.vmap(lambda T, q: ik(arm, T, q, config)))(poses, present)
+    result = jax.jit(jax.vmap(lambda pose, q: ik(arm, pose, q, config)))(poses, present)
     return poses, present, result
 
 
@@ -104,12 +104,12 @@ def test_ik_keeps_joints_that_solve_already_and_prefers_the_nearest(arm):
     start = jnp.asarray([0.2, 0.6, -0.3, 1.1, 0.4, -0.7, 0.5, 0.01, 0.03])
     pose = camera_pose(arm, forward_kinematics(arm, start))
     far = jnp.asarray([-2.9, -0.6, 2.8, -1.1, -2.7, 0.7, -2.6, 0.01, 0.03])
-    result, _ = jax.jit(lambda T, s, q: ik_from_starts(arm, T, s, q, CONFIG))(pose, jnp.stack([far, start]), start)
+    result, _ = jax.jit(lambda starts: ik_from_starts(arm, pose, starts, start, CONFIG))(jnp.stack([far, start]))
     np.testing.assert_allclose(result.qpos, start, atol=1e-3)
 
 
 def test_ik_never_fails_loudly(arm):
-    solve = jax.jit(lambda T, q: ik(arm, T, q, dataclasses.replace(CONFIG, num_seeds=2)))
+    solve = jax.jit(lambda pose, q: ik(arm, pose, q, dataclasses.replace(CONFIG, num_seeds=2)))
     far = SE3.from_translation(jnp.asarray([5.0, 0.0, 0.0]))
     nan = SE3.from_translation(jnp.asarray([jnp.nan, 0.0, 0.0]))
     for pose, qpos in ((far, arm.home), (nan, arm.home), (far, arm.home * jnp.nan)):

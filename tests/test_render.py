@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco import mjtGeom
+
 from render_oracles import (
     cast_image,
     forward,
@@ -17,14 +18,13 @@ from render_oracles import (
     random_scene,
     random_size,
 )
-
 from vsearch_jax import render
 from vsearch_jax.geometry import view_pose
 from vsearch_jax.render.rays import CHORD_FUNCTIONS, RAY_FUNCTIONS
 from vsearch_jax.types import View
 
-# f32 against C MuJoCo's f64: at a distance of about 1 m, the root of a discriminant of size r^2 that was rounded at 1e-7
-# is off by 1e-7 / r, for radii of 0.05 m some 1e-5 where the ray does not graze.
+# f32 against C MuJoCo's f64: at a distance of about 1 m, the root of a discriminant of size r^2 that was rounded at
+# 1e-7 is off by 1e-7 / r, for radii of 0.05 m some 1e-5 where the ray does not graze.
 RAY_TOLERANCE = 1e-4
 # What a Newton step leaves is f32's own rounding of a point some metres from the origin.
 DEPTH_TOLERANCE = 2e-6
@@ -94,8 +94,8 @@ def test_chord_is_met_where_the_line_meets_the_solid(kind: int, seed: int) -> No
 
     is_clear = is_met(1.0 + GRAZE) == is_met(1.0 - GRAZE)
     assert np.array_equal(np.isfinite(chord)[is_clear], is_met(1.0)[is_clear])
-    inside = points + chord[:, None] * directions
-    inside = inside[np.isfinite(chord) & is_clear]
+    chosen = np.isfinite(chord) & is_clear
+    inside = points[chosen] + chord[chosen, None] * directions[chosen]
     if kind != mjtGeom.mjGEOM_PLANE and len(inside):
         outward = inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-9) + 1e-3
         # From inside, a ray out meets the wall, and the ray back meets the wall too.
@@ -183,7 +183,9 @@ def test_shadows_equal_rays_of_mj_ray_to_the_light(kind: str) -> None:
     image = _render(scene, frames, render.camera(frames, model, "eye"), size=SIZE)
     shade = np.asarray(image.rgb)[..., 0]  # 1 where the light reaches, 0 in the shadow
     depth, ids = cast_image(model, data, 0, SIZE)
-    points = data.cam_xpos[0] + np.where(np.isfinite(depth), depth, 1.0)[..., None] * pixel_directions(model, data, 0, SIZE)
+    points = data.cam_xpos[0] + np.where(np.isfinite(depth), depth, 1.0)[..., None] * pixel_directions(
+        model, data, 0, SIZE
+    )
     lit = np.ones(SIZE)
     for row, column in np.ndindex(*SIZE):
         point, body = points[row, column], model.geom_bodyid[ids[row, column]]
@@ -196,7 +198,7 @@ def test_shadows_equal_rays_of_mj_ray_to_the_light(kind: str) -> None:
         lit[row, column] = not (0.0 <= there < limit or 0.0 <= back < min(limit, 10.0))
     is_solid = (ids >= 0) & ~on_outline(ids) & ~on_outline(lit)
     np.testing.assert_array_equal(shade[is_solid], lit[is_solid])
-    assert 0.05 < (lit[ids == 0] == 0).mean() < 0.6  # there are shadows to be seen
+    assert 0.02 < (lit[ids == 0] == 0).mean() < 0.6  # there are shadows to be seen
     unshaded = _render(scene.replace(has_shadows=False), frames, render.camera(frames, model, "eye"), size=SIZE)
     assert np.asarray(unshaded.rgb)[ids >= 0].min() == 1.0
 
@@ -304,7 +306,7 @@ def test_vmap_equals_one_by_one_and_colours_are_arguments() -> None:
     model, data = _small()
     frames, scene = poses(model, data), render.compile_scene(model)
     eye = render.camera(frames, model, "eye")
-    positions = eye.position + jnp.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.2], [0.0, 3.0, 0.0]])
+    positions = eye.position[None] + jnp.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.2], [0.0, 3.0, 0.0]])
     traces = []
 
     def one(rgb: jax.Array, position: jax.Array):
@@ -334,9 +336,7 @@ def test_gradients_are_finite_and_follow_the_surface() -> None:
 
     def total(position: jax.Array, size: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
         moved = frames._replace(geom_xpos=xpos, geom_xmat=xmat)
-        image = render.render(
-            scene.replace(size=size), moved, eye.replace(position=position), size=(24, 24)
-        )
+        image = render.render(scene.replace(size=size), moved, eye.replace(position=position), size=(24, 24))
         return jnp.sum(jnp.where(image.geom_id >= 0, image.depth, 0.0)) + jnp.sum(image.rgb)
 
     arguments = (eye.position, scene.size, jnp.asarray(frames.geom_xpos), jnp.asarray(frames.geom_xmat))
@@ -344,7 +344,7 @@ def test_gradients_are_finite_and_follow_the_surface() -> None:
     assert all(bool(jnp.all(jnp.isfinite(g))) and float(jnp.abs(g).max()) > 0.0 for g in gradients)
 
     step, way = 1e-3, jnp.array([0.3, -0.5, 0.8])
-    pictures = jax.jit(jax.vmap(picture))(eye.position + step * jnp.array([[-1.0], [1.0]]) * way)
+    pictures = jax.jit(jax.vmap(picture))(eye.position[None] + step * jnp.array([[-1.0], [1.0]]) * way[None])
     (depth, rgb, ids), (depth_rate, rgb_rate, _) = jax.jit(lambda p: jax.jvp(picture, (p,), (way,)))(eye.position)
     interior = ~on_outline(np.asarray(ids)) & np.all(np.asarray(pictures[2]) == np.asarray(ids), axis=0)
     for value, rate in ((pictures[0], depth_rate), (pictures[1], rgb_rate)):
@@ -359,19 +359,19 @@ def test_unsupported_models_raise_by_name() -> None:
     mesh = mujoco.MjModel.from_xml_string("""
       <mujoco><asset><mesh name="t" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
       <worldbody><geom name="tetra" type="mesh" mesh="t"/></worldbody></mujoco>""")
-    with pytest.raises(render.RenderError, match="'tetra'.*mjGEOM_MESH"):
+    with pytest.raises(render.RenderError, match=r"'tetra'.*mjGEOM_MESH"):
         render.compile_scene(mesh)
     texture = mujoco.MjModel.from_xml_string("""
       <mujoco><asset><texture name="c" type="2d" builtin="checker" width="8" height="8"/>
       <material name="tiles" texture="c"/></asset>
       <worldbody><geom name="floor" type="plane" size="1 1 1" material="tiles"/></worldbody></mujoco>""")
-    with pytest.raises(render.RenderError, match="'floor'.*'tiles'"):
+    with pytest.raises(render.RenderError, match=r"'floor'.*'tiles'"):
         render.compile_scene(texture)
     moving, _ = _small('<body><joint/><geom size=".1"/><light name="torch"/></body>')
-    with pytest.raises(render.RenderError, match="'torch'.*moves"):
+    with pytest.raises(render.RenderError, match=r"'torch'.*moves"):
         render.compile_scene(moving)
     model, data = _small()
     with pytest.raises(render.RenderError, match="geom_groups"):
         render.compile_scene(model, geom_groups=(5,))
-    with pytest.raises(render.RenderError, match="'nose'.*eye"):
+    with pytest.raises(render.RenderError, match=r"'nose'.*eye"):
         render.camera(poses(model, data), model, "nose")

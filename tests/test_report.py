@@ -8,10 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from made_up import evaluation, reach, trials
 from PIL import Image
 from rich.console import Console
 
+from made_up import evaluation, reach, search, trials
 from vsearch_jax import report
 from vsearch_jax.config import Config
 from vsearch_jax.report.table import rows
@@ -110,7 +110,7 @@ def test_table_shows_ours_beside_the_thesis(results: dict[str, Any]) -> None:
 def test_report_writes_results_figures_and_one_page(
     tmp_path: Path, arrays: dict[str, Any], results: dict[str, Any]
 ) -> None:
-    pictures = report.draw(results, arrays, reach(), lines(), CONFIG)
+    pictures = report.draw(results, arrays, search(), reach(), lines(), CONFIG)
     report.write(tmp_path, results, pictures, CONFIG)
     assert json.loads((tmp_path / "results.json").read_text()) == json.loads(json.dumps(results))
     page = (tmp_path / "report.html").read_text()
@@ -126,7 +126,7 @@ def test_figures_stand_runs_that_found_nothing(arrays: dict[str, Any]) -> None:
     nothing = {name: values | {"is_success": np.zeros_like(values["is_success"])} for name, values in arrays.items()}
     summary = report.results(nothing, CONFIG, {})
     no_band = dataclasses.replace(reach(), is_reachable=jnp.zeros((12, 7), bool))
-    for picture in report.draw(summary, nothing, no_band, [], CONFIG).values():
+    for picture in report.draw(summary, nothing, search(), no_band, [], CONFIG).values():
         picture.canvas.draw()
 
 

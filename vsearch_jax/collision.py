@@ -1,7 +1,7 @@
 """Signed distances between the arm's capsules and what they must not touch.
 
 Two capsules have a closed form (Ericson, Real-Time Collision Detection, 5.1.9). From a capsule to another convex solid
-the distance is that of the solid, minimised over the capsule's axis; it is convex there, so that a golden section finds it.
+the distance is that of the solid, minimised over the capsule's axis; it is convex there, so a golden section finds it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from vsearch_jax.kinematics import rotate
+
 GEOM = mujoco.mjtGeom
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
-# 0.618^14 = 1e-3 of the axis, and near the least distance the distance itself changes less by far. The ends are looked at too.
+# 0.618^14 = 1e-3 of the axis; near its minimum the distance changes by far less. The ends are looked at too.
 SEARCH_ITERATIONS = 14
 # Newton's steps from the left of a convex sum converge quadratically, and what is left shortens the distance.
 NEWTON_ITERATIONS = 4
@@ -127,8 +129,8 @@ def distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Ar
       table_height: f32[] m, world z.
     """
     rotation = geom_xmat[pairs.geom]
-    center = geom_xpos[pairs.geom] + _rotate(rotation, pairs.center)
-    half_axis = _rotate(rotation, pairs.half_axis)
+    center = geom_xpos[pairs.geom] + rotate(rotation, pairs.center)
+    half_axis = rotate(rotation, pairs.half_axis)
     lowest = center[:, 2] - jnp.abs(half_axis[:, 2]) - pairs.radius
     table = jnp.min(lowest[pairs.table] - table_height, initial=jnp.inf)
     first, second = pairs.first, pairs.second
@@ -185,7 +187,7 @@ def ellipsoid_distance(point: Array, size: Array) -> Array:
     """Returns the signed distance f32[] in m of `point` (f32[3]) from an ellipsoid of radii `size` (f32[3]).
 
     The foot of the perpendicular is r^2 p / (t + r^2) with t the largest root of sum (r p / (t + r^2))^2 = 1 (Eberly,
-    Distance from a Point to an Ellipsoid). That sum is convex and falls, so Newton's steps from its left do not overshoot.
+    Distance from a Point to an Ellipsoid). The sum is convex and falls, so Newton's steps from the left stay left.
     """
     p = jnp.maximum(jnp.abs(point), 1e-7)  # keeps the foot unique at the centre and in the planes of symmetry
     squared = size * size
@@ -204,7 +206,13 @@ def _nearest_on_axis(solids: Solids, num_blocks: int, center: Array, half_axis: 
     at = functools.partial(_distances_on_axis, solids, num_blocks, center, half_axis)
     low = jnp.full(center.shape[0], -1.0)
     high = -low
-    state = (low, high, at(high - GOLDEN * (high - low)), at(low + GOLDEN * (high - low)), jnp.minimum(at(low), at(high)))
+    state = (
+        low,
+        high,
+        at(high - GOLDEN * (high - low)),
+        at(low + GOLDEN * (high - low)),
+        jnp.minimum(at(low), at(high)),
+    )
     *_, f_low, f_high, f_ends = jax.lax.fori_loop(0, SEARCH_ITERATIONS, functools.partial(_narrow, at), state)
     return jnp.minimum(jnp.minimum(f_low, f_high), f_ends)
 
@@ -228,10 +236,6 @@ def _narrow(at: Callable[[Array], Array], _: int, state: tuple[Array, ...]) -> t
 
 def _norm(vector: Array) -> Array:
     return jnp.sqrt(jnp.maximum(jnp.sum(vector * vector, axis=-1), 1e-24))
-
-
-def _rotate(rotation: Array, vector: Array) -> Array:
-    return jnp.sum(rotation * vector[..., None, :], axis=-1)
 
 
 def _rotate_back(rotation: Array, vector: Array) -> Array:

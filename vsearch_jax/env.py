@@ -128,7 +128,7 @@ class ViewSearchEnv(Env):
         return reachability_map(self.arm, self.center, self.scene.radius, self.config.ik, key)
 
     def solve(self, view: View, qpos: Array) -> tuple[Array, Array]:
-        """Returns joints f32[nq] for `view`, of those found the nearest to `qpos` (f32[nq]), and bool[] is_reachable."""
+        """Returns joints f32[nq] for `view`, of those found the nearest to `qpos`, and bool[] is_reachable."""
         result, is_reachable = solve_view(
             self.arm, self.reach, view, qpos, (self.center, self.scene.radius), self.config.ik
         )

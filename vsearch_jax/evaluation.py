@@ -39,15 +39,24 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Any]:
       `steps_lower_bound` i32: no policy needs fewer steps.
 
     Raises:
-      ConfigError: the arm can't reach the target view.
+      ConfigError: the arm can't reach the target view, or nothing at every azimuth.
     """
     check_target(state.reach, config)
     return _evaluate(state, config)
 
 
 def check_target(reach: ReachabilityMap, config: Config) -> None:
-    """Raises ConfigError where the target view of random search and CMA-ES lies outside the reachable band."""
+    """Checks that there is a reachable band and that the target view of random search and CMA-ES lies in it.
+
+    Raises:
+      ConfigError: the arm reaches no elevation at every azimuth, or not the target's.
+    """
     low, high = np.rad2deg(np.asarray(reach.band))
+    if np.isnan(low):
+        raise ConfigError(
+            f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
+            f"at every azimuth around object {config.scene.object!r}; try another mount_height or radius"
+        )
     elevation = config.evaluation.target_elevation_deg
     if not low - 1e-3 <= elevation <= high + 1e-3:
         raise ConfigError(
@@ -68,9 +77,10 @@ def _evaluate(state: TrainState, config: Config) -> dict[str, Any]:
 
 
 def initial_views(config: Config, band: Array) -> View:
-    """Returns View of f32[num_initial_views]: even in azimuth, equally many in each quadrant, elevations spread over the band.
+    """Returns View of f32[num_initial_views]: even in azimuth, elevations spread over the band.
 
-    Azimuths lie half a spacing off the axes; elevations step through 1/6, 3/6 and 5/6 of the band (f32[2] rad).
+    Azimuths lie half a spacing off the axes, equally many in each quadrant; elevations step through 1/6, 3/6 and 5/6 of
+    the band (f32[2] rad).
     """
     number = jnp.arange(config.evaluation.num_initial_views)
     azimuth = wrap_angle((number + 0.5) * (2.0 * jnp.pi / config.evaluation.num_initial_views))
@@ -83,10 +93,7 @@ def evaluate_search(key: Array, env: ViewSearchEnv, search: Any, search_config: 
     views = initial_views(env.config, env.reach.band)
     views = jax.tree.map(lambda x: jnp.repeat(x, settings.num_runs), views)
     target_key, trials_key = jax.random.split(key)
-    target_view = View(
-        wrap_angle(jnp.deg2rad(settings.target_azimuth_deg)), jnp.deg2rad(settings.target_elevation_deg)
-    )
-    target, _ = env.look(target_view, env.random_joints(target_key))
+    target, _ = env.look(protocol_target(env.config), env.random_joints(target_key))
     run = functools.partial(run_trial, env=env, target=target, search=search, search_config=search_config)
     keys = jax.random.split(trials_key, views.azimuth.shape[0])
     samples = getattr(search_config, "num_samples", None) or search_config.population
@@ -156,9 +163,10 @@ def evaluate_policies(key: Array, env: ViewSearchEnv, state: TrainState) -> dict
 
 
 def run_episode(key: Array, *, env: ViewSearchEnv, actor: Any, grid: Sight) -> dict[str, Any]:
-    """Runs one episode of a policy's mean action and measures where it ended."""
-    start = env.reset(key)
-    result, end = sac.search(start, env.step, actor, env.config.sac, env.config.env)
+    """Runs one episode of a policy and measures where it ended."""
+    reset_key, search_key = jax.random.split(key)
+    start = env.reset(reset_key)
+    result, end = sac.search(search_key, start, env.step, actor, env.config.sac, env.config.env)
     first, last = start.pipeline_state, end.pipeline_state
     return outcome(env, last.sight, last.target, result) | {
         "initial_view": first.sight.view,
@@ -206,3 +214,41 @@ def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, co
     )
     steps = jnp.minimum(to_grid, to_target) / math.radians(config.env.action_scale_deg)
     return jnp.maximum(jnp.ceil(steps - 1e-5), 1.0).astype(jnp.int32)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def record_search(state: TrainState, config: Config) -> dict[str, Array]:
+    """Returns one search of the first policy in pictures: from the far side of the object to the protocol's target.
+
+    Returns:
+      `images` f32[T + 1, H, W, 3], start first, T = `episode_length`; `similarity` f32[T + 1]; `target` f32[H, W, 3];
+      `num_steps` i32[], after which the rest repeats.
+    """
+    env = ViewSearchEnv(config, state.encoder, state.reach)
+    actor = jax.tree.map(lambda x: x[0], state.sac.actor)
+    initial_key, target_key = jax.random.split(state.key)
+    target_view = protocol_target(config)
+    far_side = View(wrap_angle(target_view.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))
+    initial, _ = env.look(far_side, env.random_joints(initial_key))
+    target, _ = env.look(target_view, env.random_joints(target_key))
+    start = env.start(initial, target)
+
+    def step(state: Any, _: None) -> tuple[Any, Any]:
+        moved = env.step(state, sac.act(None, actor, state.obs, config.sac))
+        moved = jax.tree.map(lambda new, old: jnp.where(state.done > 0, old, new), moved, state)
+        return moved, moved
+
+    _, states = jax.lax.scan(step, start, length=config.env.episode_length)
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
+    return {
+        "images": jax.lax.map(lambda qpos: env.picture(qpos)[1].rgb, states.pipeline_state.sight.qpos),
+        "similarity": states.metrics["similarity"],
+        "target": env.picture(target.qpos)[1].rgb,
+        "num_steps": states.pipeline_state.num_steps[-1],
+    }
+
+
+def protocol_target(config: Config) -> View:
+    """Returns the target view of random search and CMA-ES, f32[] rad."""
+    settings = config.evaluation
+    return View(wrap_angle(jnp.deg2rad(settings.target_azimuth_deg)), jnp.deg2rad(settings.target_elevation_deg))

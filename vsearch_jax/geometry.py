@@ -53,7 +53,7 @@ def rotation_error(a: Array, b: Array) -> Array:
 
 
 def frobenius_angle(a: Array, b: Array) -> Array:
-    """Returns formula 3.2 of the thesis in rad: arccos of the normalised Frobenius product of `a` and `b` (f32[..., 3, 3])."""
+    """Returns formula 3.2 of the thesis in rad, arccos of a third of the Frobenius product (f32[..., 3, 3] each)."""
     product = jnp.sum(a * b, axis=(-2, -1)) / 3.0
     limit = 1.0 - 1e-7  # arccos has no gradient at its ends
     return jnp.arccos(jnp.clip(product, -limit, limit))

@@ -18,7 +18,7 @@ import numpy as np
 
 from vsearch_jax import checkpoint, report, run_folder
 from vsearch_jax.config import Config
-from vsearch_jax.evaluation import evaluate
+from vsearch_jax.evaluation import check_target, evaluate, record_search
 from vsearch_jax.metrics_log import STAGES, MetricsLog, read_metrics
 from vsearch_jax.run_folder import RunError
 from vsearch_jax.training import init, train
@@ -39,6 +39,7 @@ def start(run: Path, config: Config, seed: int) -> TrainState:
     """
     with run_folder.claimed(run):
         state = in_thread(init, jax.random.key(seed), config)
+        check_target(state.reach, config)  # now, not when the training is done
         run_folder.write_config(run, config)
         checkpoint.save(run, state, config)
     return state
@@ -104,6 +105,7 @@ def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str,
       OSError: the disk is full or not writable.
     """
     check_finished(run, state, config)
+    jax.clear_caches()  # the compiled training, some GiB, is not needed any more
     began = time.perf_counter()
     arrays = in_thread(evaluate, state, config)
     lines = read_metrics(run)
@@ -112,7 +114,8 @@ def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str,
     }
     wall_seconds["evaluation"] = time.perf_counter() - began
     results = report.results(arrays, config, wall_seconds)
-    pictures = report.draw(results, arrays, state.reach, lines, config)
+    search = jax.tree.map(np.asarray, in_thread(record_search, state, config))
+    pictures = report.draw(results, arrays, search, state.reach, lines, config)
     report.write(run, results, pictures, config)
     return results
 

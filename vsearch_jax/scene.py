@@ -84,7 +84,7 @@ def build_scene(config: SceneConfig) -> Scene:
 
     Raises:
       SceneError: a name is unknown, a file is missing or cannot be loaded, the arm has no site `tcp`, no camera `wrist`
-        or no hinge or slide joint that moves the camera, or the object has no geom.
+        or no joint that moves the camera, has a joint that is neither a hinge nor a slide, or the object has no geom.
     """
     arm_path, object_path = _find("arm", config.arm), _find("object", config.object)
     arm, target = _load_arm(arm_path), _load_object(object_path)
@@ -125,10 +125,14 @@ def _find(part: str, name: str) -> Path:
     path = Path(name).expanduser()
     if path.suffix or path.parent != Path("."):
         if not path.is_file():
-            raise SceneError(f"{part} file {name!r} does not exist; give a file or one of: {', '.join(available(folder))}")
+            raise SceneError(
+                f"{part} file {name!r} does not exist; give a file or one of: {', '.join(available(folder))}"
+            )
         return path.resolve()
     if name not in available(folder):
-        raise SceneError(f"unknown {part} {name!r}; available: {', '.join(available(folder))}, or give the path of a file")
+        raise SceneError(
+            f"unknown {part} {name!r}; available: {', '.join(available(folder))}, or give the path of a file"
+        )
     return xml_folder() / folder / f"{name}.xml"
 
 
@@ -146,7 +150,14 @@ def _load_arm(path: Path) -> mujoco.MjSpec:
     spec = _load("arm", path)
     for kind, name, elements in (("site", TCP_SITE, spec.sites), ("camera", WRIST_CAMERA, spec.cameras)):
         if name not in [element.name for element in elements]:
-            raise SceneError(f"arm file {str(path)!r} has no {kind} named {name!r}; add one to the body that holds the tool")
+            raise SceneError(
+                f"arm file {str(path)!r} has no {kind} named {name!r}; add one to the body that holds the tool"
+            )
+    for joint in spec.joints:
+        if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            raise SceneError(
+                f"arm file {str(path)!r}: joint {joint.name!r} is free or a ball; make it hinges or take it out"
+            )
     return spec
 
 
@@ -194,11 +205,6 @@ def _camera_joints(model: mujoco.MjModel, camera_id: int, path: Path) -> tuple[i
         body = int(model.body_parentid[body])
     if not joints:
         raise SceneError(f"arm file {str(path)!r} has no joint that moves the camera {WRIST_CAMERA!r}")
-    allowed = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    for joint in joints:
-        if int(model.jnt_type[joint]) not in allowed:
-            name = model.joint(joint).name.removeprefix(ARM_PREFIX)
-            raise SceneError(f"arm file {str(path)!r}: joint {name!r} moves the camera; it must be a hinge or a slide")
     return tuple(joints)
 
 
@@ -212,9 +218,17 @@ def _geoms_below(model: mujoco.MjModel, root: int) -> tuple[int, ...]:
 
 
 def _put_model(model: mujoco.MjModel) -> mjx.Model:
+    # MJX refuses a model whose solids it cannot collide with one another, unless none may collide.
     without_contacts = copy.copy(model)
+    without_contacts.geom_contype[:] = 0
+    without_contacts.geom_conaffinity[:] = 0
     without_contacts.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    return mjx.put_model(without_contacts)
+    try:
+        return mjx.put_model(without_contacts)
+    except NotImplementedError as error:
+        raise SceneError(
+            f"the model uses what MJX does not support: {_one_line(error)}; take it out of the arm"
+        ) from error
 
 
 def _one_line(error: Exception) -> str:

@@ -151,7 +151,9 @@ def training_example(key: Array, *, env: ViewSearchEnv) -> tuple[Array, Array]:
     lit_scene = encoders.randomize_lights(light_key, env.render_scene, env.center)
     image = render.render(lit_scene, data, encoders.jitter_camera(camera_key, camera), (size, size))
     pixels = encoders.network_input(image, object_ids, env.config)
-    inputs = encoders.augment_input(picture_key, pixels, render.silhouette(image, env.scene.object_geom_ids), env.config)
+    inputs = encoders.augment_input(
+        picture_key, pixels, render.silhouette(image, env.scene.object_geom_ids), env.config
+    )
 
     clean_scene = env.render_scene.replace(has_shadows=False)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     clean = render.render(clean_scene, data, camera, (decoder_size, decoder_size))

@@ -12,7 +12,7 @@ from vsearch_jax.encoder import network
 from vsearch_jax.types import EncoderState
 
 _BISECTIONS = 16  # the threshold is then known to the largest error / 65,536, and the loss to the square of that
-_EIGENVALUE_FLOOR = 1e-4  # directions with less than this part of the largest variance count as noise
+_EIGENVALUE_FLOOR = 1e-2  # smaller ones are mostly noise: shadows of other arm joints, light
 
 
 def init(key: Array, config: Config) -> EncoderState:
@@ -86,7 +86,7 @@ def fit_whitening(raw: Array, power: float) -> tuple[Array, Array]:
     """Returns mean and partial whitening of raw latents, to be kept in EncoderState.
 
     Whitening is the symmetric matrix with the covariance's eigenvectors and its eigenvalues to the power -`power`.
-    Small eigenvalues count as 1e-4 of the largest, so that directions of noise are not blown up. The overall scale
+    Small eigenvalues count as 1e-2 of the largest, so that directions of noise are not blown up. The overall scale
     means nothing to a cosine; it is chosen so that the largest variance keeps its size.
 
     Args:

@@ -36,8 +36,8 @@ class _Iterate(NamedTuple):
 def ik(arm: Arm, T_world_camera: SE3, qpos: Array, config: IKConfig) -> IKResult:
     """Returns joints that bring the wrist camera to `T_world_camera`.
 
-    Starts are the present joints and `config.num_seeds - 1` others, spread evenly over the limits. Of the solutions, the
-    nearest to the present joints is returned, one without contact before one with; without a solution the closest try.
+    Starts are the present joints and `config.num_seeds - 1` others, spread evenly over the limits. Of the solutions the
+    nearest to the present joints is returned, one without contact before one with; without any, the closest try.
     Joints that do not move the camera (fingers) stay.
 
     Args:
@@ -155,9 +155,7 @@ def _solve(arm: Arm, target: SE3, start: Array, qpos: Array, config: IKConfig) -
     )
 
 
-def _step(
-    arm: Arm, target: tuple[Array, Array], limits: tuple[Array, Array], _: int, state: _Iterate
-) -> _Iterate:
+def _step(arm: Arm, target: tuple[Array, Array], limits: tuple[Array, Array], _: int, state: _Iterate) -> _Iterate:
     """One step of Levenberg-Marquardt, kept only if the cost falls; NaN never falls, so the joints stay finite."""
     lower, upper = limits
     descent = state.jacobian.T @ state.error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import NamedTuple
 
 import jax
@@ -19,6 +20,8 @@ from vsearch_jax.types import IKResult, ReachabilityMap, View
 
 # Every round solves each cell from new random starts, from its own joints and from those of its four neighbours.
 NUM_ROUNDS = 4
+# Azimuths solved at once: 12 of 19 elevations and 11 starts take about 60 MB.
+MOST_AZIMUTHS = 12
 
 
 class _Grid(NamedTuple):
@@ -32,9 +35,9 @@ class _Grid(NamedTuple):
 def reachability_map(arm: Arm, center: Array, radius: float | Array, config: IKConfig, key: Array) -> ReachabilityMap:
     """Solves the inverse kinematics of every view of the grid; traceable, the fingers stay at home.
 
-    Each cell is solved from random starts, in rounds; in between, the joints of a cell are tried on its four neighbours,
-    so that a cell that chance has missed is found from beside it. Of the valid solutions a cell keeps the one farthest
-    from its limits.
+    Each cell is solved from random starts, in rounds; in each, the joints of its four neighbours are tried too, so that
+    a cell that chance has missed is found from beside it. Of the valid solutions a cell keeps the one farthest from the
+    joint limits.
 
     Args:
       arm: the arm.
@@ -65,7 +68,7 @@ def reachability_map(arm: Arm, center: Array, radius: float | Array, config: IKC
 
 
 def nearest_cell(reach: ReachabilityMap, view: View) -> tuple[Array, Array]:
-    """Returns i32[] azimuth and elevation index of the reachable cell nearest to `view`; of any, where none is reachable."""
+    """Returns i32[] azimuth and elevation index of the reachable cell nearest to `view`, of any where none is."""
     azimuth = wrap_angle(reach.azimuths - view.azimuth) * jnp.cos(view.elevation)
     elevation = reach.elevations - view.elevation
     distance = azimuth[:, None] ** 2 + elevation[None, :] ** 2
@@ -101,8 +104,9 @@ def _round(
     shape = (*qpos.shape[:2], num_random, qpos.shape[2])
     random_starts = jax.random.uniform(jax.random.fold_in(key, index), shape, minval=grid.lower, maxval=grid.upper)
     starts = jnp.concatenate([_with_neighbours(qpos), random_starts], axis=2)
-    # One azimuth at a time bounds the memory.
-    return jax.lax.map(functools.partial(_solve_row, arm, config), (grid.poses, starts))
+    # Some azimuths at a time bound the memory; their number divides that of all, else the rest would be compiled apart.
+    batch_size = math.gcd(qpos.shape[0], MOST_AZIMUTHS)
+    return jax.lax.map(functools.partial(_solve_row, arm, config), (grid.poses, starts), batch_size=batch_size)
 
 
 def _solve_row(arm: Arm, config: IKConfig, row: tuple[SE3, Array]) -> tuple[Array, Array]:

@@ -9,6 +9,15 @@ import jax.numpy as jnp
 from jax import Array
 
 
+def _is_left(state: tuple[Array, Array, Any]) -> Array:
+    return state[0] < state[1]
+
+
+def _change(state: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
+    # Never runs; a body that changed nothing would be optimised away.
+    return state[0] + 1, state[1], jax.tree.map(lambda leaf: leaf + jnp.ones((), leaf.dtype), state[2])
+
+
 @jax.custom_jvp
 def materialize(tree: Any, zero: Array) -> Any:
     """Returns `tree` as it is, but written to memory before it is used.
@@ -17,17 +26,10 @@ def materialize(tree: Any, zero: Array) -> Any:
     it. The arguments of a loop are written, though, even if its run-time number of iterations is none.
 
     Args:
-      tree: pytree of arrays.
+      tree: pytree of arrays of numbers.
       zero: i32[], always 0, in a way that the compiler cannot know; see `unknown_zero`.
     """
-
-    def is_left(state: tuple[Array, Any]) -> Array:
-        return state[0] < zero
-
-    def body(state: tuple[Array, Any]) -> tuple[Array, Any]:
-        return state[0] + 1, jax.tree.map(lambda leaf: leaf + jnp.ones((), leaf.dtype), state[1])
-
-    return jax.lax.while_loop(is_left, body, (jnp.zeros((), jnp.int32), tree))[1]
+    return jax.lax.while_loop(_is_left, _change, (jnp.zeros_like(zero), zero, tree))[2]
 
 
 @materialize.defjvp
@@ -35,6 +37,9 @@ def _materialize_jvp(primals: tuple[Any, Array], tangents: tuple[Any, Any]) -> t
     return materialize(*primals), tangents[0]
 
 
-def unknown_zero(positive: Array) -> Array:
-    """Returns i32[] 0, computed from f32[] `positive`, which the caller knows to be above 0."""
-    return (jax.lax.stop_gradient(positive) < 0.0).astype(jnp.int32)
+def unknown_zero(lengths: Array) -> Array:
+    """Returns i32[] 0, computed from `lengths` (any shape), none of which is beyond 1e30.
+
+    They must be known at run time only: what the compiler can compute is no secret to it.
+    """
+    return jnp.any(jax.lax.stop_gradient(lengths) > 1e30).astype(jnp.int32)

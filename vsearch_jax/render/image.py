@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -18,13 +19,18 @@ from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.render.surface import level
 from vsearch_jax.types import Camera, Image
 
+# Height and width of the part of an image that is drawn at a time on a CPU: the some forty planes of a batch of such
+# parts stay in its cache, and a part meets fewer geoms than the whole.
+_CPU_TILE = (32, 64)
+
 
 def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int]) -> Image:
     """Returns what `camera` sees.
 
     Depth and geom_id are those of C MuJoCo's `mj_ray` through the pixels' centres; colours follow MuJoCo's light model,
     evaluated in every pixel, with sharp shadows. There is no near or far plane. A surface seen from inside its solid is
-    lit as from outside.
+    lit as from outside. Derivatives are those of the geom that each pixel shows: finite, and blind to outlines and to
+    the edges of shadows.
 
     Args:
       scene: RenderScene.
@@ -35,48 +41,82 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
     Returns:
       Image of that size. What is not used of it costs nothing inside jit.
     """
-    zero = unknown_zero(camera.fovy)
-    # Else the few sines and products behind these would be computed anew in every pixel.
-    frames, (x, y) = materialize((_frames(scene, data, camera), pixel_rays(camera.fovy, size)), zero)
-    fixed_scene, fixed_frames, fixed_x, fixed_y = jax.lax.stop_gradient((scene, frames, x, y))
-    hits = trace.nearest(fixed_scene, fixed_frames, fixed_x, fixed_y)
-    depth, surface = _surface(scene, frames, hits, (x, y), zero)
-    fixed_hits = hits._replace(depth=jax.lax.stop_gradient(depth))
-    view = materialize(_view(x, y), zero)
-    incidences = []
-    for index, is_directional in enumerate(scene.lights.is_directional):
-        position = camera.rotation.T @ (scene.lights.position[index] - camera.position)
-        direction = camera.rotation.T @ scene.lights.direction[index]
-        is_lit = 1.0
-        if scene.has_shadows and scene.lights.is_shadowing[index]:
-            find = trace.lit_by_directional if is_directional else trace.lit_by_positional
-            towards = jax.lax.stop_gradient(-direction if is_directional else position)
-            is_lit = find(fixed_scene, fixed_frames, fixed_hits, (fixed_x, fixed_y), towards)
-        if is_directional:
-            incidences.append(shading.directional_incidence(surface, view, -direction, is_lit))
-        else:
-            pose = (position, direction)
-            incidences.append(shading.positional_incidence(surface, view, pose, scene.lights, index, is_lit))
-    incidences.append(shading.directional_incidence(surface, view, jnp.array([0.0, 0.0, 1.0]), 1.0))
-    rgb = jnp.where(hits.is_hit, shading.shade(scene, surface, incidences), scene.background[:, None, None])
-    geom_ids = jnp.asarray(scene.geom_ids, dtype=jnp.int32).at[hits.slot].get(mode="promise_in_bounds")
-    return Image(
-        rgb=jnp.moveaxis(rgb, 0, -1),
-        depth=jnp.where(hits.is_hit, depth, jnp.inf),
-        geom_id=jnp.where(hits.is_hit, geom_ids, -1),
-    )
+    height, width = size
+    # A GPU would rather have everything at once. A program exported to another platform is right there, if slower.
+    tile = _CPU_TILE if jax.default_backend() == "cpu" else size
+    tile_height, tile_width = min(tile[0], height), min(tile[1], width)
+    rows, columns = -(-height // tile_height), -(-width // tile_width)
+    frames = _frames(scene, data, camera)
+    zero = unknown_zero(frames.origin)
+    # Else the tangent and the products behind these would be computed anew in every pixel.
+    frames, (x, y) = materialize((frames, pixel_rays(camera.fovy, size)), zero)
+    x = jnp.pad(x, ((0, 0), (0, columns * tile_width - width)), mode="edge").reshape(columns, 1, tile_width)
+    y = jnp.pad(y, ((0, rows * tile_height - height), (0, 0)), mode="edge").reshape(rows, tile_height, 1)
+    rays = (jnp.tile(x, (rows, 1, 1)), jnp.repeat(y, columns, axis=0))
+    tiles = jax.lax.map(functools.partial(_render_tile, scene, frames, camera, zero), rays)
+
+    def join(planes: Array) -> Array:
+        grid = planes.reshape(rows, columns, -1, tile_height, tile_width).transpose(0, 3, 1, 4, 2)
+        return grid.reshape(rows * tile_height, columns * tile_width, -1)[:height, :width]
+
+    return Image(rgb=join(tiles.rgb), depth=join(tiles.depth)[..., 0], geom_id=join(tiles.geom_id)[..., 0])
 
 
 def silhouette(image: Image, geom_ids: tuple[int, ...]) -> Array:
     """Returns bool[H, W]: the pixel shows one of the geoms `geom_ids` (MuJoCo's numbers)."""
     ids = np.asarray(geom_ids, dtype=np.int32).reshape(-1)
-    return jnp.any(image.geom_id[..., None] == ids, axis=-1)
+    return jnp.any(image.geom_id[..., None] == ids[None, None], axis=-1)
+
+
+def _render_tile(
+    scene: RenderScene, frames: trace.Frames, camera: Camera, zero: Array, rays: tuple[Array, Array]
+) -> Image:
+    """Returns the image of the pixels with ray slopes `rays` (f32[1, w], f32[h, 1]); its rgb is f32[3, h, w]."""
+    hits = trace.nearest(*jax.lax.stop_gradient((scene, frames, *rays)))
+    depth, surface = _surface(scene, frames, hits, rays, zero)
+    incidences = _incidences(scene, frames, camera, hits._replace(depth=depth), surface, rays)
+    channels = shading.shade(scene, surface, materialize(incidences, zero))
+    rgb = [jnp.where(hits.is_hit, channel, scene.background[i]) for i, channel in enumerate(channels)]
+    geom_ids = jnp.asarray(scene.geom_ids, dtype=jnp.int32).at[hits.slot].get(mode="promise_in_bounds")
+    return Image(
+        rgb=jnp.stack(materialize(rgb, zero)),
+        depth=jnp.where(hits.is_hit, depth, jnp.inf),
+        geom_id=jnp.where(hits.is_hit, geom_ids, -1),
+    )
+
+
+def _incidences(
+    scene: RenderScene,
+    frames: trace.Frames,
+    camera: Camera,
+    hits: trace.Hits,
+    surface: shading.Surface,
+    rays: tuple[Array, Array],
+) -> list[shading.Incidence]:
+    """Returns how the scene's lights in their order, then the headlight, meet each pixel's surface."""
+    view, incidences = _view(*rays), []
+    for index, is_directional in enumerate(scene.lights.is_directional):
+        position = camera.rotation.T @ (scene.lights.position[index] - camera.position)
+        direction = camera.rotation.T @ scene.lights.direction[index]
+        is_lit = jnp.ones((), dtype=jnp.float32)
+        if scene.has_shadows and scene.lights.is_shadowing[index]:
+            light = -direction if is_directional else position
+            fixed = jax.lax.stop_gradient((scene, frames, hits, rays, light))
+            is_lit = trace.is_lit(*fixed, is_directional)
+        if is_directional:
+            incidences.append(shading.directional_incidence(surface, view, -direction, is_lit))
+        else:
+            pose = (position, direction)
+            incidences.append(shading.positional_incidence(surface, view, pose, scene.lights, index, is_lit))
+    forward = jnp.array([0.0, 0.0, 1.0], dtype=jnp.float32)
+    incidences.append(shading.directional_incidence(surface, view, forward, jnp.ones((), dtype=jnp.float32)))
+    return incidences
 
 
 def _frames(scene: RenderScene, data: Any, camera: Camera) -> trace.Frames:
     ids = np.asarray(scene.geom_ids)
     geom_rotation = data.geom_xmat.reshape(-1, 3, 3)[ids]
-    offset = data.geom_xpos[ids] - camera.position
+    offset = data.geom_xpos[ids] - camera.position[None]
     return trace.Frames(
         rotation=jnp.einsum("gji,jk->gik", geom_rotation, camera.rotation),
         origin=-jnp.einsum("gji,gj->gi", geom_rotation, offset),
@@ -85,16 +125,12 @@ def _frames(scene: RenderScene, data: Any, camera: Camera) -> trace.Frames:
     )
 
 
-def _look_up(table: Array, slot: Array) -> Array:
-    """Returns [P, H, W]: for each row of `table` [P, G], the entry of each pixel's geom.
+def _look_up(table: Array, slot: Array) -> list[Array]:
+    """Returns for each row of `table` [P, G] the entry of each pixel's geom, [H, W].
 
     One gather a row: XLA on CPU vectorises neither a long chain of selects nor a gather of whole rows.
     """
-
-    def plane(carry: None, row: Array) -> tuple[None, Array]:
-        return carry, row.at[slot].get(mode="promise_in_bounds")
-
-    return jax.lax.scan(plane, None, table)[1]
+    return [row.at[slot].get(mode="promise_in_bounds") for row in table]
 
 
 def _rotate(quaternion: tuple[Array, Array, Array, Array], vector: Vector) -> Vector:
@@ -117,7 +153,7 @@ def _surface(
     quaternion = jax.vmap(SO3.from_matrix)(frames.rotation).wxyz
     columns = [quaternion, frames.origin, scene.size, scene.rgb]
     columns += [v[:, None] for v in (scene.specular, scene.shininess, scene.emission)]
-    rows = _look_up(jnp.concatenate(columns, axis=1).T, hits.slot)
+    rows = materialize(_look_up(materialize(jnp.concatenate(columns, axis=1).T, zero), hits.slot), zero)
     turn, origin, size = (rows[0], rows[1], rows[2], rows[3]), rows[4:7], (rows[7], rows[8], rows[9])
     direction = materialize(_rotate(turn, (x, y, -jnp.ones_like(x))), zero)
     starts = trace.type_starts(scene)
@@ -138,7 +174,7 @@ def _surface(
     nx, ny, nz = _rotate((w, -qx, -qy, -qz), outward)
     normal = materialize((scale * nx, scale * ny, scale * nz), zero)
     point = (x * depth, y * depth, -depth)
-    return depth, shading.Surface(point, normal, rows[10:13], rows[13], rows[14], rows[15])
+    return depth, shading.Surface(point, normal, (rows[10], rows[11], rows[12]), rows[13], rows[14], rows[15])
 
 
 def _view(x: Array, y: Array) -> Vector:

@@ -7,9 +7,9 @@ Every function has the one signature `(size, point, direction) -> distance`, in 
 - `distance`: in units of `direction`'s length, the nearest at 0 or more, +inf on a miss, as C MuJoCo's `mj_ray` has it:
   a ray that starts inside a solid meets its far wall, a plane is met from its front only.
 
-`ray_*` is that. `chord_*` has the same signature and returns some point that the whole line has in common with the solid,
-of any sign, or +inf. Seen from outside, a convex solid lies wholly before or wholly behind, so the sign tells which: that
-is all a shadow needs, and is had without a root.
+`ray_*` is that. `chord_*` has the same signature and returns some point that the whole line has in common with the
+solid, of any sign, or +inf. Seen from outside, a convex solid lies wholly before or wholly behind, so the sign tells
+which: that is all a shadow needs, and for round solids it is had without a root.
 
 All solids are convex: from outside the entry counts, from inside the exit. Which of the two is one comparison of the
 origin, and costs nothing where all rays share their origin. Triples instead of a last axis of 3 let XLA vectorise over
@@ -46,7 +46,7 @@ def _quadratic_root(a: Array, b: Array, c: Array, sign: Array) -> tuple[Array, A
 
 
 def _exit_sign(is_inside: Array) -> Array:
-    """Returns which root counts; a factor, since a select of one predicate for all pixels keeps LLVM from vectorising."""
+    """Returns which root counts; a factor, as a select by one predicate for all pixels is not vectorised."""
     return jnp.where(is_inside, 1.0, -1.0)
 
 
@@ -84,9 +84,7 @@ def ray_capsule(size: Vector, point: Vector, direction: Vector) -> Array:
     radial_product = vx * px + vy * py
     squared_length = radial_length + vz * vz
     # A ray along the axis meets the endless cylinder very far out, hence at a cap.
-    side, is_side = _quadratic_root(
-        radial_length + 1e-12 * squared_length, radial_product, squared_radial, sign
-    )
+    side, is_side = _quadratic_root(radial_length + 1e-12 * squared_length, radial_product, squared_radial, sign)
     z = pz + side * vz
     dz = pz - jnp.clip(z, -half_length, half_length)
     cap, is_cap = _quadratic_root(squared_length, radial_product + vz * dz, squared_radial + dz * dz, sign)

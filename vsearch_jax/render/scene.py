@@ -114,7 +114,9 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
     groups = np.clip(mj_model.geom_group, 0, mujoco.mjNGROUP - 1)
     visible = np.flatnonzero((rgba[:, 3] > 0.0) & np.isin(groups, geom_groups))
     if visible.size == 0:
-        raise RenderError(f"no geom of groups {geom_groups} is visible; choose other geom_groups or give a geom an alpha")
+        raise RenderError(
+            f"no geom of groups {geom_groups} is visible; choose other geom_groups or give a geom an alpha"
+        )
     for geom in visible:
         _check_geom(mj_model, int(geom))
     ids = visible[np.argsort(mj_model.geom_type[visible], kind="stable")]
@@ -162,12 +164,14 @@ def _check_geom(model: mujoco.MjModel, geom: int) -> None:
     kind = int(model.geom_type[geom])
     if kind not in RAY_FUNCTIONS:
         raise RenderError(
-            f"{name} is of type {mjtGeom(kind).name}, which cannot be rendered; replace it by primitives, give it alpha 0 "
-            "or leave out its group"
+            f"{name} is of type {mjtGeom(kind).name}, which cannot be rendered; replace it by primitives, "
+            "give it alpha 0 or leave out its group"
         )
     material = int(model.geom_matid[geom])
     if material >= 0 and np.any(model.mat_texid[material] >= 0):
-        raise RenderError(f"{name} has the textured material {model.mat(material).name!r}; textures cannot be rendered: remove it")
+        raise RenderError(
+            f"{name} has the textured material {model.mat(material).name!r}; textures cannot be rendered: remove it"
+        )
 
 
 def _compile_lights(model: mujoco.MjModel) -> Lights:
@@ -199,4 +203,6 @@ def _check_light(model: mujoco.MjModel, light: int) -> None:
         raise RenderError(f"{name} is an image light, which cannot be rendered; use type directional, spot or point")
     is_fixed = model.light_mode[light] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
     if model.body_weldid[model.light_bodyid[light]] != 0 or not is_fixed:
-        raise RenderError(f"{name} moves; only lights fixed to the world can be rendered: give it mode fixed, in the worldbody")
+        raise RenderError(
+            f"{name} moves; only lights fixed to the world can be rendered: give it mode fixed, in the worldbody"
+        )

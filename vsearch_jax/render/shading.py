@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -20,7 +19,7 @@ class Surface(NamedTuple):
     Attributes:
       point: three f32[H, W] m.
       normal: three f32[H, W], unit, towards the camera's side.
-      rgb: f32[3, H, W] in [0, 1].
+      rgb: three f32[H, W] in [0, 1].
       specular: f32[H, W].
       shininess: f32[H, W].
       emission: f32[H, W].
@@ -28,7 +27,7 @@ class Surface(NamedTuple):
 
     point: Vector
     normal: Vector
-    rgb: Array
+    rgb: Vector
     specular: Array
     shininess: Array
     emission: Array
@@ -43,12 +42,12 @@ class Incidence(NamedTuple):
       specular: f32[H, W], the highlight, 0 or more.
     """
 
-    strength: Array | float
+    strength: Array
     diffuse: Array
     specular: Array
 
 
-def _incidence(surface: Surface, view: Vector, to_light: Vector, strength: Array | float) -> Incidence:
+def _incidence(surface: Surface, view: Vector, to_light: Vector, strength: Array) -> Incidence:
     """Blinn's highlight with a viewer at the camera (OpenGL 2.1 specification, 2.14.1)."""
     cosine = dot(surface.normal, to_light)
     # half = (to_light + view) / |to_light + view|
@@ -58,7 +57,7 @@ def _incidence(surface: Surface, view: Vector, to_light: Vector, strength: Array
     return Incidence(strength, jnp.maximum(cosine, 0.0), jnp.where(cosine > 0.0, highlight, 0.0))
 
 
-def directional_incidence(surface: Surface, view: Vector, to_light: Array, is_lit: Array | float) -> Incidence:
+def directional_incidence(surface: Surface, view: Vector, to_light: Array, is_lit: Array) -> Incidence:
     """Returns how a light at infinity meets the surface.
 
     Args:
@@ -71,7 +70,7 @@ def directional_incidence(surface: Surface, view: Vector, to_light: Array, is_li
 
 
 def positional_incidence(
-    surface: Surface, view: Vector, pose: tuple[Array, Array], lights: Lights, index: int, is_lit: Array | float
+    surface: Surface, view: Vector, pose: tuple[Array, Array], lights: Lights, index: int, is_lit: Array
 ) -> Incidence:
     """Returns how light `index`, a spot or a point, meets the surface.
 
@@ -96,10 +95,8 @@ def positional_incidence(
     return _incidence(surface, view, to_light, is_lit * fading * cone)
 
 
-def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> Array:
-    """Returns f32[3, H, W] in [0, 1].
-
-    The channels are a scan, which keeps XLA from computing what they share anew for each of them.
+def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> list[Array]:
+    """Returns red, green and blue, f32[H, W] in [0, 1].
 
     Args:
       scene: materials and colours of the lights.
@@ -107,16 +104,13 @@ def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> 
       incidences: of the scene's lights in their order, then of the headlight.
     """
     lights = scene.lights
-    ambient = jnp.concatenate([lights.ambient, scene.headlight_ambient[None]])
-    diffuse = jnp.concatenate([lights.diffuse, scene.headlight_diffuse[None]])
-    specular = jnp.concatenate([lights.specular, scene.headlight_specular[None]])
-
-    def channel(carry: None, colours: tuple[Array, Array, Array, Array, Array]) -> tuple[None, Array]:
-        rgb, from_nowhere, ambients, diffuses, speculars = colours
-        matte, gloss = surface.emission + from_nowhere, 0.0
-        for i, light in enumerate(incidences):
-            matte += light.strength * (ambients[i] + diffuses[i] * light.diffuse)
-            gloss += light.strength * speculars[i] * light.specular
-        return carry, jnp.clip(rgb * matte + surface.specular * gloss, 0.0, 1.0)
-
-    return jax.lax.scan(channel, None, (surface.rgb, scene.ambient, ambient.T, diffuse.T, specular.T))[1]
+    colours = [(lights.ambient[i], lights.diffuse[i], lights.specular[i]) for i in range(len(lights.is_directional))]
+    colours.append((scene.headlight_ambient, scene.headlight_diffuse, scene.headlight_specular))
+    channels = []
+    for i in range(3):
+        matte, gloss = surface.emission + scene.ambient[i], 0.0
+        for (ambient, diffuse, specular), light in zip(colours, incidences, strict=True):
+            matte += light.strength * (ambient[i] + diffuse[i] * light.diffuse)
+            gloss += light.strength * specular[i] * light.specular
+        channels.append(jnp.clip(surface.rgb[i] * matte + surface.specular * gloss, 0.0, 1.0))
+    return channels

@@ -28,7 +28,8 @@ def _capsule(size: Vector, point: Vector) -> Level:
 
 
 def _ellipsoid(size: Vector, point: Vector) -> Level:
-    sx, sy, sz = (1.0 / (s * s) for s in size)
+    # Pixels of other geoms pass through here too, with sizes that may be 0; their NaN would spoil the gradient.
+    sx, sy, sz = (1.0 / jnp.maximum(s * s, 1e-12) for s in size)
     slope = (point[0] * sx, point[1] * sy, point[2] * sz)
     return 0.5 * (dot(slope, point) - 1.0), slope
 

@@ -7,6 +7,7 @@ with the most.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -42,7 +43,7 @@ class Hits(NamedTuple):
 
     Attributes:
       slot: i32[H, W], row of the geom in the scene; 0 on a miss.
-      depth: f32[H, W] m, up to `depth_error`; 1 on a miss.
+      depth: f32[H, W] m; 1 on a miss. From `nearest` it is exact up to the bits that held the row.
       is_hit: bool[H, W].
     """
 
@@ -82,6 +83,18 @@ def _triple(vector: Array) -> Vector:
     return vector[0], vector[1], vector[2]
 
 
+def _is_left(rank: Array, state: tuple[Array, Array]) -> Array:
+    return state[0] < rank[-1]
+
+
+def _visit(
+    value: Callable[[int, Array], Array], kind: int, start: int, rank: Array, state: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    count, best = state
+    row = start + jnp.argmax(rank == count + 1)
+    return count + 1, jnp.minimum(best, value(kind, row))
+
+
 def _minimum_over_geoms(
     scene: RenderScene, is_kept: Array, value: Callable[[int, Array], Array], initial: Array
 ) -> Array:
@@ -90,16 +103,8 @@ def _minimum_over_geoms(
     stops = [start for _, start in starts[1:]] + [len(scene.geom_types)]
     for (kind, start), stop in zip(starts, stops, strict=True):
         rank = jnp.cumsum(is_kept[start:stop])
-
-        def visit(state: tuple[Array, Array], kind: int = kind, start: int = start, rank: Array = rank):
-            count, best = state
-            row = start + jnp.argmax(rank == count + 1)
-            return count + 1, jnp.minimum(best, value(kind, row))
-
-        def is_left(state: tuple[Array, Array], rank: Array = rank):
-            return state[0] < rank[-1]
-
-        _, best = jax.lax.while_loop(is_left, visit, (jnp.zeros((), rank.dtype), best))
+        visit = functools.partial(_visit, value, kind, start, rank)
+        _, best = jax.lax.while_loop(functools.partial(_is_left, rank), visit, (jnp.zeros_like(rank[0]), best))
     return best
 
 
@@ -108,16 +113,17 @@ def _in_view(frames: Frames, x: Array, y: Array) -> Array:
     depth = -frames.center[:, 2]
     is_kept = depth > -frames.radius
     for axis, slopes in ((0, x), (1, y)):
-        slope = jnp.max(jnp.abs(slopes))
-        outside = jnp.abs(frames.center[:, axis]) - slope * depth
-        is_kept &= outside < frames.radius * jnp.sqrt(1.0 + slope * slope)
+        for slope, side in ((jnp.max(slopes), 1.0), (jnp.min(slopes), -1.0)):
+            outside = side * (frames.center[:, axis] - slope * depth)
+            is_kept &= outside < frames.radius * jnp.sqrt(1.0 + slope * slope)
     return is_kept
 
 
 def nearest(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
     """Returns the nearest geom of each pixel.
 
-    The row number stands in the low bits of the depth's bit pattern, which order as the depths do: one minimum finds both.
+    The row number stands in the low bits of the depth's bit pattern. Bit patterns order as the depths do, so that one
+    minimum finds both.
 
     Args:
       scene: shapes.
@@ -140,36 +146,15 @@ def nearest(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
     return Hits(jnp.where(is_hit, packed & mask, 0), jnp.where(is_hit, depth, 1.0), is_hit)
 
 
-def _between(frames: Frames, hits: Hits, x: Array, y: Array, to_light: Array, distance: Array | float) -> Array:
-    """Returns bool[G]: the geom's bounding sphere reaches into the hull of all hit points and the light.
-
-    Args:
-      frames: Frames.
-      hits: Hits.
-      x: f32[1, W], slopes of the pixels' rays.
-      y: f32[H, 1].
-      to_light: f32[3], from the camera towards the light: a unit vector where `distance` is +inf, else the way in m.
-      distance: 1, or +inf for a light at infinity.
-    """
-    near = jnp.min(jnp.where(hits.is_hit, hits.depth, jnp.inf))
-    far = jnp.max(jnp.where(hits.is_hit, hits.depth, -jnp.inf))
-    # The hit points lie in a frustum from `near` to `far`; this sphere around a point of the axis holds it.
-    near, far = jnp.where(near < far, near, 1.0), jnp.where(near < far, far, 1.0)
-    middle = 0.5 * (near + far)
-    radius = jnp.sqrt((far - middle) ** 2 + far * far * (jnp.max(jnp.abs(x)) ** 2 + jnp.max(jnp.abs(y)) ** 2))
-    sphere = jnp.stack([jnp.zeros_like(middle), jnp.zeros_like(middle), -middle])
-    way = to_light if distance == jnp.inf else to_light - sphere
-    offset = frames.center - sphere
-    along = jnp.clip(offset @ way / jnp.maximum(way @ way, 1e-20), 0.0, distance)
-    gap = offset - along[:, None] * way
-    reach = frames.radius + radius
-    return jnp.sum(gap * gap, axis=-1) <= reach * reach
-
-
-def lit_by_directional(
-    scene: RenderScene, frames: Frames, hits: Hits, rays: tuple[Array, Array], to_light: Array
+def is_lit(
+    scene: RenderScene,
+    frames: Frames,
+    hits: Hits,
+    rays: tuple[Array, Array],
+    light: Array,
+    is_directional: bool,
 ) -> Array:
-    """Returns f32[H, W]: 0 where a geom stands between the pixel's surface and a light at infinity, else 1.
+    """Returns f32[H, W]: 0 where a geom stands between the pixel's surface and the light, else 1.
 
     A geom is convex, so it never shades the part of itself that faces the light: its own row is passed over, and a
     surface needs no bias against itself.
@@ -177,40 +162,47 @@ def lit_by_directional(
     Args:
       scene: shapes.
       frames: Frames.
-      hits: Hits.
+      hits: Hits, with exact depths.
       rays: slopes of the pixels' rays, f32[1, W] and f32[H, 1].
-      to_light: f32[3], unit vector towards the light in the camera's frame.
+      light: f32[3] in the camera's frame: m, where the light is, or for a directional light a unit vector towards it.
+      is_directional: static.
     """
     x, y = rays
     point = (x * hits.depth, y * hits.depth, -hits.depth)
+    # Rays run from the surface to a light at infinity, from any other light to the surface: what they share is computed
+    # once for all pixels.
+    if is_directional:
+        start, way, low, high = point, _triple(light), scene.shadow_offset, jnp.full_like(hits.depth, jnp.inf)
+    else:
+        start, way = _triple(light), (point[0] - light[0], point[1] - light[1], point[2] - light[2])
+        low, high = 0.0, 1.0 - scene.shadow_offset / jnp.sqrt(jnp.maximum(dot(way, way), 1e-12))
 
-    def is_clear(kind: int, row: Array) -> Array:
-        start = apply(frames.rotation[row], point, frames.origin[row])
-        direction = apply(frames.rotation[row], _triple(to_light))
-        chord = CHORD_FUNCTIONS[kind](_triple(scene.size[row]), start, direction)
-        is_blocked = (chord > scene.shadow_offset) & (chord < jnp.inf) & (hits.slot != row)
-        return jnp.where(is_blocked, 0.0, 1.0)
+    def lit_past(kind: int, row: Array) -> Array:
+        local_start = apply(frames.rotation[row], start, frames.origin[row])
+        local_way = apply(frames.rotation[row], way)
+        chord = CHORD_FUNCTIONS[kind](_triple(scene.size[row]), local_start, local_way)
+        return jnp.where((chord > low) & (chord < high) & (hits.slot != row), 0.0, 1.0)
 
-    is_kept = _between(frames, hits, x, y, to_light, jnp.inf)
-    return _minimum_over_geoms(scene, is_kept, is_clear, jnp.ones_like(hits.depth))
+    is_kept = _between(frames, hits, rays, light, is_directional)
+    return _minimum_over_geoms(scene, is_kept, lit_past, jnp.ones_like(hits.depth))
 
 
-def lit_by_positional(
-    scene: RenderScene, frames: Frames, hits: Hits, rays: tuple[Array, Array], light: Array
-) -> Array:
-    """Returns f32[H, W]: as `lit_by_directional`, for a light at f32[3] m in the camera's frame.
-
-    The rays start at the light, which they share, so that what depends on their origin is computed once.
-    """
-    x, y = rays
-    way = (x * hits.depth - light[0], y * hits.depth - light[1], -hits.depth - light[2])
-    limit = 1.0 - scene.shadow_offset / jnp.sqrt(jnp.maximum(dot(way, way), 1e-12))
-
-    def is_clear(kind: int, row: Array) -> Array:
-        start = apply(frames.rotation[row], _triple(light), frames.origin[row])
-        direction = apply(frames.rotation[row], way)
-        chord = CHORD_FUNCTIONS[kind](_triple(scene.size[row]), start, direction)
-        return jnp.where((chord > 0.0) & (chord < limit) & (hits.slot != row), 0.0, 1.0)
-
-    is_kept = _between(frames, hits, x, y, light, 1.0)
-    return _minimum_over_geoms(scene, is_kept, is_clear, jnp.ones_like(hits.depth))
+def _between(frames: Frames, hits: Hits, rays: tuple[Array, Array], light: Array, is_directional: bool) -> Array:
+    """Returns bool[G]: the geom's bounding sphere reaches into the hull of all hit points and the light."""
+    near = jnp.min(jnp.where(hits.is_hit, hits.depth, jnp.inf))
+    far = jnp.max(jnp.where(hits.is_hit, hits.depth, -jnp.inf))
+    near, far = jnp.where(near <= far, near, 1.0), jnp.where(near <= far, far, 1.0)
+    # The hit points lie in a frustum from `near` to `far`; a sphere around a point of its axis holds it.
+    middle = 0.5 * (near + far)
+    x_middle, y_middle = (0.5 * (jnp.min(slopes) + jnp.max(slopes)) for slopes in rays)
+    x_half, y_half = (0.5 * (jnp.max(slopes) - jnp.min(slopes)) for slopes in rays)
+    sphere = middle * jnp.stack([x_middle, y_middle, -jnp.ones_like(middle)])
+    axis_length = jnp.sqrt(1.0 + x_middle * x_middle + y_middle * y_middle)
+    reach = frames.radius + (far - middle) * axis_length + far * jnp.sqrt(x_half * x_half + y_half * y_half)
+    # The hull lies within that radius of the line from the sphere's middle to the light.
+    way = light if is_directional else light - sphere
+    offset = frames.center - sphere[None]
+    along = jnp.maximum(offset @ way / jnp.maximum(way @ way, 1e-20), 0.0)
+    along = along if is_directional else jnp.minimum(along, 1.0)
+    gap = offset - along[:, None] * way[None]
+    return jnp.sum(gap * gap, axis=-1) <= reach * reach

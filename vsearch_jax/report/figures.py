@@ -103,9 +103,9 @@ def search_progress(name: str, trials: Mapping[str, Any], samples: int, threshol
     is_success = np.asarray(trials["is_success"])
     figure = Figure(figsize=(8, 4.6))
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    images = samples * np.arange(1, best.shape[1] + 1)
+    images = 1 + samples * np.arange(1, best.shape[1] + 1)  # the first is that of the initial view
     for scores, count in zip(best, evaluations, strict=True):
-        end = int(np.ceil(count / samples))
+        end = int(np.ceil((count - 1) / samples))
         upper.plot(images[:end], scores[:end], color=COLORS[name], alpha=0.2, linewidth=0.9)
     upper.plot(images, np.median(best, axis=0), color=INK, label="median")
     upper.axhline(threshold, color=INK, linestyle=":", linewidth=1.2, label=f"threshold {threshold:g}")

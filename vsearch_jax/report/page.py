@@ -20,6 +20,7 @@ from vsearch_jax.report.table import FOOTNOTE, rows
 from vsearch_jax.types import ReachabilityMap
 
 CAPTIONS = {
+    "search": "A search by the policy, from the far side of the object",
     "comparison": "The searchers side by side",
     "random_search": "Random search",
     "cma_es": "CMA-ES",
@@ -33,6 +34,7 @@ CAPTIONS = {
 def draw(
     results: Mapping[str, Any],
     arrays: Mapping[str, Any],
+    search: Mapping[str, Any],
     reach: ReachabilityMap,
     lines: Sequence[Mapping[str, Any]],
     config: Config,
@@ -42,6 +44,7 @@ def draw(
     Args:
       results: what `results.json` holds.
       arrays: what `evaluate` returned.
+      search: what `record_search` returned.
       reach: the arm's reachability map.
       lines: the lines of metrics.jsonl.
       config: the run's config.
@@ -49,7 +52,9 @@ def draw(
     threshold = config.env.threshold
     samples = {"random_search": config.random_search.num_samples, "cma_es": config.cma_es.population}
     progress = {name: figures.search_progress(name, arrays[name], samples[name], threshold) for name in samples}
+    seen = slice(0, int(search["num_steps"]) + 1)
     return {
+        "search": figures.search_strip(search["images"][seen], search["similarity"][seen], search["target"]),
         "comparison": figures.comparison(results),
         **progress,
         "sac_evaluation": figures.policy_episodes(arrays["sac"]),

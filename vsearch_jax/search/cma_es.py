@@ -36,8 +36,8 @@ from vsearch_jax.types import SearchResult, View
 _AZIMUTH_UNIT = math.pi / 2.0
 _UNREACHABLE_FITNESS = 5.0  # above 1 - cosine, at most 2, by more than the bounds' penalty
 _BOUND_PENALTY = 1.0  # for each squared unit outside the band
-_SMALLEST_SIGMA = 0.05  # units, 4.5 deg of azimuth: about the basin of a threshold of 0.98
-_STALL_GENERATIONS = 4
+_SIGMA_RANGE = (1.5, 9.0)  # rad of azimuth for each unit of missing cosine; the first is random search's k
+_STALL_GENERATIONS = 6
 _STALL_IMPROVEMENT = 3e-3
 
 
@@ -48,13 +48,15 @@ class _Carry:
     Attributes:
       record: Record.
       strategy: evosax's state.
-      run_fitness: f32[], best fitness since the last restart.
-      stalled: i32[], generations since that improved.
+      run_fitness: f32[], best fitness since the last restart at a random view.
+      run_point: f32[2] units, where it was seen.
+      stalled: i32[], generations since it improved.
     """
 
     record: Record
     strategy: Any
     run_fitness: Array
+    run_point: Array
     stalled: Array
 
 
@@ -62,10 +64,14 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: CMAESConfig)
     """Searches the view sphere by CMA-ES that starts at the initial view and restarts where it gets stuck.
 
     Azimuth is periodic, so it has no bounds. A sample whose elevation is outside the band is moved to its edge, and its
-    squared distance is added to the fitness 1 - cosine (Hansen's boundary handling, with a fixed weight). When the
-    largest axis has shrunk below 4.5 deg of azimuth, or four generations did not improve, the strategy restarts with
-    the initial step size at a random view, and the best view of all starts is kept. The search ends at the threshold
-    or after `config.max_generations`; if the initial view meets the threshold, after its one image.
+    squared distance is added to the fitness 1 - cosine (Hansen's boundary handling, with a fixed weight).
+
+    Far from the target the cosine is nearly flat and has local optima, on which the plain strategy contracts. Rules
+    keep it from that: the step size stays between 1.5 and 9 rad for each unit of missing cosine, and not above the
+    initial one; below, it is raised; above, the strategy starts anew at the best view of this start. After six
+    generations without improvement it starts anew at a random view. The best view of all starts is kept. The search
+    ends at the threshold or after `config.max_generations`; if the initial view meets the threshold, after its one
+    image.
 
     Args:
       key: PRNG key.
@@ -84,6 +90,7 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: CMAESConfig)
         record=start_record(args.initial, score_fn(args.initial, args.task), config.max_generations),
         strategy=_start(algorithm, params, _to_units(args.initial, args.band)),
         run_fitness=jnp.float32(jnp.inf),
+        run_point=_to_units(args.initial, args.band),
         stalled=jnp.int32(0),
     )
     body = functools.partial(_generation, key, score_fn, args, (algorithm, params))
@@ -101,18 +108,25 @@ def _generation(key: Array, score_fn: ScoreFn, args: SearchArgs, method: tuple[C
     fitness = jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2
     with _evosax_promotion():
         strategy, _ = algorithm.tell(sample_key, population, fitness, strategy, params)
-    best = jnp.min(fitness)
-    has_improved = best < carry.run_fitness - _STALL_IMPROVEMENT
-    stalled = jnp.where(has_improved, 0, carry.stalled + 1)
-    largest_sigma = strategy.std * jnp.sqrt(jnp.linalg.eigvalsh(strategy.C)[-1])
-    is_stuck = (stalled >= _STALL_GENERATIONS) | (largest_sigma < _SMALLEST_SIGMA)
-    mean = jax.random.uniform(restart_key, (2,), minval=jnp.array([-2.0, -1.0]), maxval=jnp.array([2.0, 1.0]))
-    fresh = _start(algorithm, params, mean)
+    best = jnp.argmin(fitness)
+    stalled = jnp.where(fitness[best] < carry.run_fitness - _STALL_IMPROVEMENT, 0, carry.stalled + 1)
+    is_stalled = stalled >= _STALL_GENERATIONS
+    run_point = jnp.where(fitness[best] < carry.run_fitness, population[best], carry.run_point)
+    run_fitness = jnp.minimum(fitness[best], carry.run_fitness)
+    random_point = jax.random.uniform(restart_key, (2,), minval=jnp.array([-2.0, -1.0]), maxval=jnp.array([2.0, 1.0]))
+
+    largest_axis = jnp.sqrt(jnp.linalg.eigvalsh(strategy.C)[-1])
+    floor, ceiling = (jnp.minimum(k * run_fitness / _AZIMUTH_UNIT, params.std_init) for k in _SIGMA_RANGE)
+    is_wide = strategy.std * largest_axis > ceiling
+    strategy = strategy.replace(std=jnp.maximum(strategy.std, floor / largest_axis))
+    fresh = _start(algorithm, params, jnp.where(is_stalled, random_point, run_point))
+    fresh = fresh.replace(std=jnp.where(is_stalled, params.std_init, ceiling))
     return _Carry(
         record=add_generation(carry.record, views, scores, args.threshold),
-        strategy=jax.tree.map(lambda a, b: jnp.where(is_stuck, a, b), fresh, strategy),
-        run_fitness=jnp.where(is_stuck, jnp.inf, jnp.minimum(best, carry.run_fitness)),
-        stalled=jnp.where(is_stuck, 0, stalled),
+        strategy=jax.tree.map(lambda a, b: jnp.where(is_stalled | is_wide, a, b), fresh, strategy),
+        run_fitness=jnp.where(is_stalled, jnp.inf, run_fitness),
+        run_point=run_point,
+        stalled=jnp.where(is_stalled, 0, stalled),
     )
 
 

@@ -1,0 +1,149 @@
+"""The view-search task: SPEC.md 7 line by line, against C MuJoCo's kinematics, and under brax's own wrappers."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from brax.envs.wrappers.training import wrap
+
+import vsearch_jax as vs
+from vsearch_jax.env import pose_error
+from vsearch_jax.geometry import cosine_similarity, view_pose
+from vsearch_jax.types import View
+
+CONFIG = vs.Config.preset("smoke")
+
+
+@pytest.fixture(scope="module")
+def env():
+    return vs.ViewSearchEnv(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def reset(env):
+    return jax.jit(env.reset)
+
+
+@pytest.fixture(scope="module")
+def step(env):
+    return jax.jit(env.step)
+
+
+def test_sizes_are_those_of_the_contract(env, reset):
+    assert (env.observation_size, env.action_size) == (265, 2)
+    state = reset(jax.random.key(0))
+    assert state.obs.shape == (265,)
+    sight, target = state.pipeline_state.sight, state.pipeline_state.target
+    np.testing.assert_array_equal(state.obs, np.concatenate([sight.code, target.code, sight.qpos]))
+
+
+def test_initial_view_and_target_are_random_over_the_band(env, reset):
+    keys = jax.random.split(jax.random.key(1), 32)
+    states = [reset(key) for key in keys]
+    elevations = np.array([s.pipeline_state.sight.view.elevation for s in states])
+    azimuths = np.array([s.pipeline_state.target.view.azimuth for s in states])
+    low, high = np.asarray(env.reach.band)
+    assert ((elevations >= low - 1e-6) & (elevations <= high + 1e-6)).all()
+    assert np.ptp(elevations) > 0.5 * (high - low)
+    assert (np.histogram(azimuths, bins=4, range=(-np.pi, np.pi))[0] > 0).all()
+
+
+def test_camera_stands_where_c_mujoco_puts_it_and_within_tolerance_of_the_view(env, reset):
+    sight = reset(jax.random.key(2)).pipeline_state.sight
+    model = env.scene.mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:] = sight.qpos
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(sight.camera.position, data.cam_xpos[env.scene.camera_id], atol=1e-5)
+    np.testing.assert_allclose(sight.camera.rotation.reshape(-1), data.cam_xmat[env.scene.camera_id], atol=1e-5)
+    assert data.ncon == 0
+    wanted = view_pose(sight.view, env.center, env.scene.radius)
+    assert np.linalg.norm(wanted.translation() - sight.camera.position) < CONFIG.ik.position_tolerance
+
+
+def test_a_step_moves_by_the_scaled_action_and_pays_cosine_less_one(env, reset, step):
+    state = reset(jax.random.key(3))
+    before = state.pipeline_state
+    inward = np.sign(np.mean(env.reach.band) - before.sight.view.elevation)
+    after = step(state, jnp.array([0.5, 0.1 * inward]))
+    sight = after.pipeline_state.sight
+    assert after.info["is_reachable"] == 1.0
+    turn = np.angle(np.exp(1j * (sight.view.azimuth - before.sight.view.azimuth)))
+    np.testing.assert_allclose(np.rad2deg(turn), 15.0, atol=1e-3)
+    np.testing.assert_allclose(np.rad2deg(sight.view.elevation - before.sight.view.elevation), 3.0 * inward, atol=1e-3)
+    similarity = cosine_similarity(sight.code, before.target.code)
+    expected = CONFIG.env.success_reward if similarity >= CONFIG.env.threshold else similarity - 1.0
+    np.testing.assert_allclose(after.reward, expected, atol=1e-6)
+
+
+def test_an_unreachable_view_costs_two_and_the_arm_stays(env, reset, step):
+    state = reset(jax.random.key(4))
+    low = View(state.pipeline_state.sight.view.azimuth, env.reach.band[0])
+    state = env.start(env.look(low, state.pipeline_state.sight.qpos)[0], state.pipeline_state.target)
+    after = step(state, jnp.array([0.0, -1.0]))
+    assert after.info["is_reachable"] == 0.0
+    assert after.reward == -2.0
+    assert after.done == 0.0
+    np.testing.assert_array_equal(after.obs, state.obs)
+    assert after.pipeline_state.num_steps == 1
+
+
+def test_the_threshold_terminates_with_two(env, reset, step):
+    state = reset(jax.random.key(5))
+    there = env.start(state.pipeline_state.sight, state.pipeline_state.sight)
+    after = step(there, jnp.zeros(2))
+    assert (after.reward, after.done, after.info["terminated"], after.info["truncated"]) == (2.0, 1.0, 1.0, 0.0)
+    errors = pose_error(after.pipeline_state.sight.camera, after.pipeline_state.target.camera)
+    assert float(errors[0]) < np.deg2rad(2.0)
+    assert float(errors[2]) < 5e-3
+
+
+def test_an_episode_is_truncated_after_its_last_step_and_that_is_not_done(reset, step):
+    state = reset(jax.random.key(6))
+    # A target that nothing matches.
+    episode = state.pipeline_state.replace(target=state.pipeline_state.target.replace(code=jnp.zeros(128)))
+    state = state.replace(pipeline_state=episode)
+    truncated = []
+    for _ in range(CONFIG.env.episode_length):
+        state = step(state, jnp.zeros(2))
+        truncated.append(float(state.info["truncated"]))
+        assert state.done == 0.0
+    assert truncated == [0.0] * (CONFIG.env.episode_length - 1) + [1.0]
+
+
+def test_brax_wrappers_run_it(env):
+    wrapped = wrap(env, episode_length=3)
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    wrapped_step = jax.jit(wrapped.step)
+    lengths = []
+    for _ in range(6):
+        state = wrapped_step(state, jnp.zeros((2, 2)))
+        lengths.append(np.asarray(state.info["steps"]).tolist())
+        assert np.isfinite(state.obs).all()
+    assert max(max(length) for length in lengths) == 3
+    assert np.asarray(state.info["truncation"] + state.done).max() >= 0.0
+
+
+@pytest.mark.brax_trainer
+def test_braxs_own_sac_trains_on_it(env):
+    from brax.training.agents.sac import train as brax_sac
+
+    seen = []
+    _, params, _ = brax_sac.train(
+        env,
+        num_timesteps=2000,
+        episode_length=CONFIG.env.episode_length,
+        num_envs=16,
+        num_eval_envs=16,
+        num_evals=2,
+        min_replay_size=256,
+        grad_updates_per_step=4,
+        batch_size=64,
+        progress_fn=lambda steps, metrics: seen.append((steps, metrics["eval/episode_reward"])),
+    )
+    assert seen[-1][0] >= 2000
+    assert all(np.isfinite(reward) for _, reward in seen)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))

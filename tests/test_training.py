@@ -1,0 +1,104 @@
+"""The run as one function: one trace, equal chunks, seeds that matter, nothing that is not a number."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsearch_jax as vs
+from vsearch_jax import training
+
+CONFIG = vs.Config.preset("smoke")
+
+
+def arrays(state):
+    """Returns the leaves by path, keys as their data."""
+    leaves = jax.tree_util.tree_flatten_with_path(state)[0]
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    return {jax.tree_util.keystr(p): np.asarray(jax.random.key_data(x) if is_key(x) else x) for p, x in leaves}
+
+
+def run(config, seed=0):
+    state, rows = vs.init(jax.random.key(seed), config), []
+    for _ in range(config.num_chunks):
+        state, metrics = vs.train(state, config)
+        rows.append(jax.tree.map(np.asarray, metrics))
+    return state, {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+
+
+@pytest.fixture(scope="module")
+def chunked():
+    training._train.clear_cache()
+    state, metrics = run(CONFIG)
+    return state, metrics, training._train._cache_size()
+
+
+def test_every_chunk_of_a_config_is_one_trace(chunked):
+    assert chunked[2] == 1
+
+
+def test_an_uncut_run_equals_its_chunks_bit_for_bit(chunked):
+    state, metrics = run(dataclasses.replace(CONFIG, num_chunks=1))
+    for path, expected in arrays(chunked[0]).items():
+        np.testing.assert_array_equal(arrays(state)[path], expected, err_msg=path)
+    count = CONFIG.num_iterations
+    for name, expected in chunked[1].items():
+        np.testing.assert_array_equal(metrics[name][:count], expected[:count], err_msg=name)
+
+
+def test_metrics_belong_to_their_stage(chunked):
+    metrics = chunked[1]
+    stage, updates = metrics["stage"], CONFIG.encoder.num_updates
+    assert stage.tolist()[: CONFIG.num_iterations] == [0] * updates + [1] * CONFIG.num_policy_iterations
+    assert np.isfinite(metrics["encoder_loss"][:updates]).all()
+    assert np.isnan(metrics["encoder_loss"][updates:]).all()
+    assert np.isfinite(metrics["reward"][stage == 1]).all()
+    is_learning = np.arange(CONFIG.num_policy_iterations) * CONFIG.sac.num_envs >= CONFIG.sac.num_warmup_steps
+    np.testing.assert_array_equal(np.isfinite(metrics["critic_loss"][stage == 1]), is_learning)
+
+
+def test_the_encoder_learns_and_then_stays(chunked):
+    losses = chunked[1]["encoder_loss"][: CONFIG.encoder.num_updates]
+    assert losses[-1] < losses[0]
+    start = vs.init(jax.random.key(0), CONFIG)
+    half = dataclasses.replace(CONFIG, num_chunks=4)
+    state, _ = vs.train(start, half)  # the chunk that ends within the policy stage
+    for _ in range(3):
+        before = arrays(state.encoder)
+        state, metrics = vs.train(state, half)
+        if (np.asarray(metrics["stage"]) == 1).all():
+            after = arrays(state.encoder)
+            assert all((before[path] == after[path]).all() for path in before)
+
+
+def test_whole_state_is_finite(chunked):
+    for path, leaf in arrays(chunked[0]).items():
+        assert np.isfinite(leaf).all(), path
+
+
+def test_replay_holds_every_environment_step(chunked):
+    replay = chunked[0].replay
+    assert np.asarray(replay.num_inserted).tolist() == [CONFIG.sac.num_environment_steps] * CONFIG.sac.num_seeds
+    assert int(chunked[0].step) == CONFIG.num_iterations
+
+
+def test_after_the_end_nothing_changes(chunked):
+    before = arrays(chunked[0])
+    copy = jax.tree.map(lambda x: x.copy(), chunked[0])  # train donates what it is given
+    state, metrics = vs.train(copy, CONFIG)
+    assert (np.asarray(metrics["stage"]) == -1).all()
+    for path, leaf in arrays(state).items():
+        np.testing.assert_array_equal(leaf, before[path], err_msg=path)
+
+
+def test_the_seed_matters(chunked):
+    other = vs.init(jax.random.key(1), CONFIG)
+    first = vs.init(jax.random.key(0), CONFIG)
+    a, b = arrays(first.encoder.params), arrays(other.encoder.params)
+    assert any((a[path] != b[path]).any() for path in a)
+    a, b = arrays(first.sac.actor), arrays(other.sac.actor)
+    assert any((a[path] != b[path]).any() for path in a)
