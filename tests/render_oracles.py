@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from mujoco import mjtGeom
+from mujoco import mjtGeom, mjtLightType
 
 SOLIDS = tuple(getattr(mjtGeom, f"mjGEOM_{name}") for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"))
 
@@ -33,23 +33,33 @@ def random_size(kind: int, rng: np.random.Generator) -> np.ndarray:
     return size
 
 
-def random_scene(rng: np.random.Generator, num_geoms: int = 20, plane: bool = True) -> mujoco.MjModel:
-    """A finite and an endless plane and `num_geoms` solids in their own bodies, before a camera `eye` at random."""
+def random_scene(rng: np.random.Generator, num_geoms: int = 20, light: mjtLightType | None = None) -> mujoco.MjModel:
+    """A finite and an endless plane and `num_geoms` solids, each in its body, before a camera `eye` at random.
+
+    With a `light`, a white scene and a single light, ambient only: what it reaches is white, its shadows are black.
+    """
     spec = mujoco.MjSpec()
     world = spec.worldbody
-    if plane:
-        world.add_geom(type=mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, -0.6])
-        world.add_geom(type=mjtGeom.mjGEOM_PLANE, size=[0.5, 0.3, 1], pos=[0.3, 0.2, -0.4], quat=rng.normal(size=4))
+    plane = world.add_body(pos=[0, 0, -0.6]).add_geom(type=mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+    tile = world.add_body(pos=[0.3, 0.2, -0.4], quat=rng.normal(size=4))
+    geoms = [plane, tile.add_geom(type=mjtGeom.mjGEOM_PLANE, size=[0.5, 0.3, 1])]
     for index in range(num_geoms):
         kind = SOLIDS[index % len(SOLIDS)]
         body = world.add_body(pos=rng.uniform(-0.9, 0.9, size=3), quat=rng.normal(size=4))
-        body.add_geom(type=kind, size=random_size(kind, rng) * 0.5, rgba=[*rng.uniform(0.2, 0.9, size=3), 1])
+        geoms.append(body.add_geom(type=kind, size=random_size(kind, rng) * 0.5))
+    for geom in geoms:
+        geom.rgba = [1, 1, 1, 1] if light is not None else [*rng.uniform(0.2, 0.9, size=3), 1]
+    if light is not None:
+        above = rng.uniform([-1.0, -1.0, 1.2], [1.0, 1.0, 2.0])
+        black, headlight = [0, 0, 0], spec.visual.headlight
+        headlight.ambient, headlight.diffuse, headlight.specular = black, black, black
+        world.add_light(type=light, pos=above, dir=-above, ambient=[1, 1, 1], diffuse=black, specular=black)
     eye = rng.normal(size=3)
-    eye *= rng.uniform(1.0, 2.0) / np.linalg.norm(eye)
+    # Without a light, the camera may be inside a solid; what is seen from there is lit as the renderer likes.
+    eye *= (rng.uniform(1.0, 2.0) if light is None else 2.5) / np.linalg.norm(eye)
     eye[2] = abs(eye[2])
-    world.add_camera(
-        name="eye", pos=eye, quat=look_at(eye, rng.uniform(-0.2, 0.2, size=3)), fovy=rng.uniform(30.0, 70.0)
-    )
+    quaternion = look_at(eye, rng.uniform(-0.2, 0.2, size=3))
+    world.add_camera(name="eye", pos=eye, quat=quaternion, fovy=rng.uniform(30.0, 70.0))
     return spec.compile()
 
 
@@ -98,3 +108,22 @@ def on_outline(ids: np.ndarray) -> np.ndarray:
     height, width = ids.shape
     shifts = [(i, j) for i in range(3) for j in range(3)]
     return np.any([padded[i : i + height, j : j + width] != ids for i, j in shifts], axis=0)
+
+
+def reached_by_light(
+    model: mujoco.MjModel, data: mujoco.MjData, points: np.ndarray, ids: np.ndarray, far: float = 10.0
+) -> np.ndarray:
+    """Returns bool[H, W]: mj_ray finds no other body than that of `ids` between each of `points` and light 0.
+
+    mj_ray meets planes from their front only, so each way is gone in both directions. A light at infinity is
+    `far` m off.
+    """
+    is_directional = model.light_type[0] == mjtLightType.mjLIGHT_DIRECTIONAL
+    is_reached = np.ones(ids.shape, dtype=bool)
+    for pixel in np.ndindex(*ids.shape):
+        way = -far * data.light_xdir[0] if is_directional else data.light_xpos[0] - points[pixel]
+        body = model.geom_bodyid[ids[pixel]]
+        there = mujoco.mj_ray(model, data, points[pixel], way, None, True, body, None)
+        back = mujoco.mj_ray(model, data, points[pixel] + way, -way, None, True, body, None)
+        is_reached[pixel] = not (0.0 <= there < 1.0 or 0.0 <= back < 1.0)
+    return is_reached

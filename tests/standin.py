@@ -1,4 +1,4 @@
-"""A run without scene and networks, in place of `init`, `train`, `evaluate` and `record_search`: what is tested is the loop around them.
+"""A run without scene and networks in place of the real one: what is tested is the loop around it.
 
 As a program it is the `vsearch` command over that run: `python standin.py train --preset smoke --out DIR`.
 """

@@ -85,7 +85,7 @@ def test_kinematics_equal_mujoco(setup):
 def test_kinematics_equal_mjx(lwr):
     model, template = lwr.scene.mjx_model, lwr.arm.data
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # mjx promotes freely
-        # One configuration: vmapped, mjx.kinematics takes minutes on CPU, see vsearch_jax/kinematics.py.
+        # One configuration: vmapped, mjx.kinematics is too slow on CPU, see vsearch_jax/kinematics.py.
         data = jax.jit(lambda qpos: mjx.kinematics(model, template.replace(qpos=qpos)))(lwr.qpos[0])
     for name in FIELDS[:-2]:  # mjx.kinematics places no cameras
         ours = lwr.fields[name][0]

@@ -142,7 +142,7 @@ def test_leftovers_of_a_killed_save_are_no_checkpoint(tmp_path: Path, template: 
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), str(Path(__file__).parent)], env=environment)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while (checkpoint.latest_step(tmp_path) or 0) < 3 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.013)
     process.send_signal(signal.SIGKILL)

@@ -32,6 +32,13 @@ def step(env):
     return jax.jit(env.step)
 
 
+@pytest.fixture
+def as_brax_computes():
+    """brax promotes types and ranks."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
 def test_sizes_are_those_of_the_contract(env, reset):
     assert (env.observation_size, env.action_size) == (265, 2)
     state = reset(jax.random.key(0))
@@ -71,7 +78,7 @@ def test_a_step_moves_by_the_scaled_action_and_pays_cosine_less_one(env, reset, 
     after = step(state, jnp.array([0.5, 0.1 * inward]))
     sight = after.pipeline_state.sight
     assert after.info["is_reachable"] == 1.0
-    turn = np.angle(np.exp(1j * (sight.view.azimuth - before.sight.view.azimuth)))
+    turn = np.angle(np.exp(1j * float(sight.view.azimuth - before.sight.view.azimuth)))
     np.testing.assert_allclose(np.rad2deg(turn), 15.0, atol=1e-3)
     np.testing.assert_allclose(np.rad2deg(sight.view.elevation - before.sight.view.elevation), 3.0 * inward, atol=1e-3)
     similarity = cosine_similarity(sight.code, before.target.code)
@@ -114,7 +121,7 @@ def test_an_episode_is_truncated_after_its_last_step_and_that_is_not_done(reset,
     assert truncated == [0.0] * (CONFIG.env.episode_length - 1) + [1.0]
 
 
-def test_brax_wrappers_run_it(env):
+def test_brax_wrappers_run_it(env, as_brax_computes):
     wrapped = wrap(env, episode_length=3)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
     wrapped_step = jax.jit(wrapped.step)
@@ -124,11 +131,11 @@ def test_brax_wrappers_run_it(env):
         lengths.append(np.asarray(state.info["steps"]).tolist())
         assert np.isfinite(state.obs).all()
     assert max(max(length) for length in lengths) == 3
-    assert np.asarray(state.info["truncation"] + state.done).max() >= 0.0
 
 
 @pytest.mark.brax_trainer
-def test_braxs_own_sac_trains_on_it(env):
+@pytest.mark.filterwarnings("ignore:jax.device_put_replicated is deprecated:DeprecationWarning")
+def test_braxs_own_sac_trains_on_it(env, as_brax_computes):
     from brax.training.agents.sac import train as brax_sac
 
     seen = []

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mujoco import mjtGeom
+from mujoco import mjtGeom, mjtLightType
 
 from render_oracles import (
     cast_image,
@@ -17,6 +17,7 @@ from render_oracles import (
     poses,
     random_scene,
     random_size,
+    reached_by_light,
 )
 from vsearch_jax import render
 from vsearch_jax.geometry import view_pose
@@ -147,59 +148,22 @@ def test_camera_inside_a_solid_sees_its_wall() -> None:
     assert np.asarray(image.rgb).min() > 0.1  # lit as from outside, by the headlight
 
 
-LIT_ONLY = """
-<mujoco>
-  <visual><headlight ambient="0 0 0" diffuse="0 0 0" specular="0 0 0"/></visual>
-  <worldbody>
-    <light type="{type}" pos=".5 -.4 2.2" dir="-.25 .2 -1" cutoff="80" exponent="0" ambient="1 1 1" diffuse="0 0 0"
-           specular="0 0 0"/>
-    <camera name="eye" pos="0 -2 2" xyaxes="1 0 0 0 .7 .7" fovy="50"/>
-    <geom type="plane" size="0 0 1" rgba="1 1 1 1"/>
-    {bodies}
-  </worldbody>
-</mujoco>
-"""
-SHADOW_GEOMS = (
-    'type="sphere" size=".15"',
-    'type="capsule" size=".08 .2" euler="30 40 0"',
-    'type="ellipsoid" size=".2 .1 .15" euler="20 0 60"',
-    'type="cylinder" size=".12 .15" euler="60 10 0"',
-    'type="box" size=".1 .15 .12" euler="10 25 40"',
-    'type="plane" size=".2 .15 .1" euler="15 -20 0"',
-)
-
-
-@pytest.mark.parametrize("kind", ["directional", "spot"])
-def test_shadows_equal_rays_of_mj_ray_to_the_light(kind: str) -> None:
-    places = [(x, y, 0.35) for y in (-0.4, 0.4) for x in (-0.6, 0.0, 0.6)]
-    bodies = "".join(
-        f'<body pos="{p[0]} {p[1]} {p[2]}"><geom rgba="1 1 1 1" {g}/></body>'
-        for p, g in zip(places, SHADOW_GEOMS, strict=True)
-    )
-    model = mujoco.MjModel.from_xml_string(LIT_ONLY.format(type=kind, bodies=bodies))
+@pytest.mark.parametrize("light", [mjtLightType.mjLIGHT_DIRECTIONAL, mjtLightType.mjLIGHT_POINT], ids=lambda x: x.name)
+@given(seed=SEEDS)
+@settings(max_examples=8)
+def test_shadows_equal_rays_of_mj_ray_to_the_light(light: mjtLightType, seed: int) -> None:
+    model = random_scene(np.random.default_rng(seed), light=light)
     data = forward(model)
-    frames = poses(model, data)
-    scene = render.compile_scene(model)
-    image = _render(scene, frames, render.camera(frames, model, "eye"), size=SIZE)
-    shade = np.asarray(image.rgb)[..., 0]  # 1 where the light reaches, 0 in the shadow
+    frames, scene = poses(model, data), render.compile_scene(model)
+    eye = render.camera(frames, model, "eye")
+    is_white = np.asarray(_render(scene, frames, eye, size=SIZE).rgb)[..., 0] > 0.5
     depth, ids = cast_image(model, data, 0, SIZE)
-    points = data.cam_xpos[0] + np.where(np.isfinite(depth), depth, 1.0)[..., None] * pixel_directions(
-        model, data, 0, SIZE
-    )
-    lit = np.ones(SIZE)
-    for row, column in np.ndindex(*SIZE):
-        point, body = points[row, column], model.geom_bodyid[ids[row, column]]
-        way = -data.light_xdir[0] if kind == "directional" else data.light_xpos[0] - point
-        limit = np.inf if kind == "directional" else 1.0
-        there = mujoco.mj_ray(model, data, point, way, None, True, body, None)
-        # Planes are met from their front only: the way back finds those that the way there did not.
-        start = point + min(limit, 10.0) * way
-        back = mujoco.mj_ray(model, data, start, -way, None, True, body, None)
-        lit[row, column] = not (0.0 <= there < limit or 0.0 <= back < min(limit, 10.0))
-    is_solid = (ids >= 0) & ~on_outline(ids) & ~on_outline(lit)
-    np.testing.assert_array_equal(shade[is_solid], lit[is_solid])
-    assert 0.02 < (lit[ids == 0] == 0).mean() < 0.6  # there are shadows to be seen
-    unshaded = _render(scene.replace(has_shadows=False), frames, render.camera(frames, model, "eye"), size=SIZE)
+    distances = np.where(np.isfinite(depth), depth, 1.0)[..., None]
+    points = data.cam_xpos[0] + distances * pixel_directions(model, data, 0, SIZE)
+    is_reached = reached_by_light(model, data, points, ids)
+    is_clear = (ids >= 0) & ~on_outline(ids) & ~on_outline(is_reached)
+    assert not np.any((is_white != is_reached) & is_clear)
+    unshaded = _render(scene.replace(has_shadows=False), frames, eye, size=SIZE)
     assert np.asarray(unshaded.rgb)[ids >= 0].min() == 1.0
 
 
@@ -214,6 +178,8 @@ def test_light_model_equals_opengls_formula() -> None:
           <light type="spot" pos="1 .5 1.5" dir="-1 -.5 -1.5" cutoff="30" exponent="7" attenuation=".5 .2 .1"
                  ambient=".01 .02 .03" diffuse=".5 .4 .3" specular=".4 .4 .4"/>
           <light type="directional" dir="0 0 1" diffuse="9 9 9" active="false"/>
+          <light type="directional" dir="-1 0 .05" ambient=".02 0 0" diffuse="1 1 1" specular="1 1 1"
+                 castshadow="false"/>
           <geom type="plane" size="0 0 1" material="m"/>
           <camera name="eye" pos=".2 -1 1" xyaxes="1 0 0 0 .7 .7" fovy="50"/>
         </worldbody>
@@ -247,6 +213,7 @@ def test_light_model_equals_opengls_formula() -> None:
     axis = -way @ data.light_xdir[1]
     cone = np.where(axis >= np.cos(np.deg2rad(30.0)), axis**7, 0.0)
     expected = expected + add(way, cone / (0.5 + 0.2 * distance + 0.1 * distance**2), colours(1))
+    expected = expected + add(np.broadcast_to(-data.light_xdir[3], points.shape), ones, colours(3))  # from behind
     headlight = (np.array([0.1, 0.11, 0.12]), np.array([0.2, 0.21, 0.22]), np.array([0.3, 0.31, 0.32]))
     backward = data.cam_xmat[0].reshape(3, 3)[:, 2]
     expected = expected + add(np.broadcast_to(backward, points.shape), ones, headlight)

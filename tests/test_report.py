@@ -102,7 +102,7 @@ def test_table_shows_ours_beside_the_thesis(results: dict[str, Any]) -> None:
     report.print_table(results, console)
     text = console.export_text()
     rate = results["random_search"]["success_rate"]
-    assert re.search(rf"success \(%\).* {100 * rate:.1f} .*–.* 95\.0 ", text)
+    assert re.search(rf"success \(%\).* {100 * rate:.2f} .*–.* 95\.00 ", text)
     assert "40.00–60.00" in text and "…" not in text
     assert "SAC seed 2" in text
 
@@ -114,7 +114,7 @@ def test_report_writes_results_figures_and_one_page(
     report.write(tmp_path, results, pictures, CONFIG)
     assert json.loads((tmp_path / "results.json").read_text()) == json.loads(json.dumps(results))
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == len(pictures) == 6
+    assert page.count("data:image/png;base64,") == len(pictures) == 7
     assert "http" not in page
     for name in pictures:
         with Image.open(tmp_path / "figures" / f"{name}.png") as image:

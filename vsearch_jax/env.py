@@ -77,8 +77,9 @@ class ViewSearchEnv(Env):
         Args:
           rng: PRNG key (the name is brax's).
         """
-        initial_key, target_key = jax.random.split(rng)
-        return self.start(self.random_sight(initial_key), self.random_sight(target_key))
+        sights = jax.vmap(self.random_sight)(jax.random.split(rng))
+        initial, target = (jax.tree.map(lambda x, i=i: x[i], sights) for i in range(2))
+        return self.start(initial, target)
 
     def start(self, sight: Sight, target: Sight) -> State:
         """Returns the start of the episode that looks for `target` from `sight`."""
@@ -97,7 +98,7 @@ class ViewSearchEnv(Env):
 
     def step(self, state: State, action: Array) -> State:
         """Returns the state after moving by `action` (f32[2], clipped to [-1, 1])."""
-        episode: EpisodeState = state.pipeline_state  # pyright: ignore[reportAssignmentType] # see start
+        episode = episode_of(state)
         task = self.config.env
         delta = jnp.clip(action, -1.0, 1.0) * math.radians(task.action_scale_deg)
         old = episode.sight
@@ -188,6 +189,11 @@ class ViewSearchEnv(Env):
         """Returns MJX data of the arm at joints `qpos` (f32[nq]) and its wrist camera."""
         data = forward_kinematics(self.arm, qpos)
         return data, render.camera_from_pose(camera_pose(self.arm, data), self.fovy)
+
+
+def episode_of(state: State) -> EpisodeState:
+    """Returns the episode that a brax State carries."""
+    return state.pipeline_state  # pyright: ignore[reportReturnType] # brax lets any pytree stand here
 
 
 def observe(episode: EpisodeState) -> Array:

@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from vsearch_jax.config import Config, ConfigError
-from vsearch_jax.env import ViewSearchEnv, pose_error
+from vsearch_jax.config import Config, ConfigError, RandomSearchConfig
+from vsearch_jax.env import ViewSearchEnv, episode_of, pose_error
 from vsearch_jax.geometry import angle_difference, cosine_similarity, wrap_angle
-from vsearch_jax.planning import nearest_cell
 from vsearch_jax.search import SearchArgs, cma_es, random_search, sac
-from vsearch_jax.types import ReachabilityMap, SearchResult, Sight, TrainState, View
+from vsearch_jax.types import Camera, ReachabilityMap, SearchResult, Sight, TrainState, View
 
 FALSE_POSITIVE_DEG = 10.0
 """A found view whose rotation is further than this from the target's is a false positive (SPEC.md 4)."""
@@ -69,11 +68,60 @@ def check_target(reach: ReachabilityMap, config: Config) -> None:
 def _evaluate(state: TrainState, config: Config) -> dict[str, Any]:
     env = ViewSearchEnv(config, state.encoder, state.reach)
     key = jax.random.fold_in(state.key, 2**31 - 1)  # a salt that training does not use
-    return {
-        "random_search": evaluate_search(jax.random.fold_in(key, 0), env, random_search.search, config.random_search),
-        "cma_es": evaluate_search(jax.random.fold_in(key, 1), env, cma_es.search, config.cma_es),
-        "sac": evaluate_policies(jax.random.fold_in(key, 2), env, state),
+    survey_key, random_search_key, cma_es_key, sac_key = jax.random.split(key, 4)
+
+    # All views known beforehand are looked at in one place: each more would be compiled anew.
+    views = jax.tree.map(lambda x: jnp.repeat(x, config.evaluation.num_runs), initial_views(config, env.reach.band))
+    num_trials = views.azimuth.shape[0]
+    known = (views, band_grid(env.reach.band), jax.tree.map(lambda x: x[None], protocol_target(config)))
+    known = jax.tree.map(lambda *x: jnp.concatenate(x), *known)
+    keys = jax.random.split(survey_key, known.azimuth.shape[0])
+    sights = map_batched(functools.partial(look_from_anywhere, env), (keys, known), config.evaluation.batch_size)
+    initial, grid, target = (jax.tree.map(lambda x, n=n: x[n], sights) for n in _split(num_trials))
+
+    results = {
+        "random_search": search_trials(
+            random_search_key, env, (random_search.search, config.random_search), initial, target
+        ),
+        "cma_es": search_trials(cma_es_key, env, (cma_es.search, config.cma_es), initial, target),
     }
+    ends = jax.tree.map(lambda *x: jnp.concatenate(x), *(result.view for result in results.values()))
+    cameras = jax.vmap(functools.partial(camera_at, env))(ends, jnp.tile(initial.qpos, (len(results), 1)))
+    outcomes: dict[str, Any] = {}
+    for number, (name, result) in enumerate(results.items()):
+        camera = jax.tree.map(lambda x, n=number: x[n * num_trials : (n + 1) * num_trials], cameras)
+        measured = jax.vmap(outcome, in_axes=(None, 0, 0, None))(config, result, camera, target.camera)
+        target_views = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_trials,)), target.view)
+        outcomes[name] = measured | {"initial_view": initial.view, "target_view": target_views}
+    return outcomes | {"sac": evaluate_policies(sac_key, env, state, grid)}
+
+
+def _split(num_trials: int) -> tuple[slice, slice, int]:
+    return slice(num_trials), slice(num_trials, -1), -1
+
+
+def map_batched(function: Any, xs: Any, batch_size: int) -> Any:
+    """Returns `function` over the leading axis of `xs`, `batch_size` items at a time.
+
+    Unlike `jax.lax.map` it compiles `function` once also where batches do not come out even: the last item is repeated.
+    """
+    count = jax.tree.leaves(xs)[0].shape[0]
+    batch_size = min(batch_size, count)
+    index = jnp.minimum(jnp.arange(count + -count % batch_size), count - 1)
+    results = jax.lax.map(function, jax.tree.map(lambda x: x[index], xs), batch_size=batch_size)
+    return jax.tree.map(lambda x: x[:count], results)
+
+
+def look_from_anywhere(env: ViewSearchEnv, item: tuple[Array, View]) -> Sight:
+    """Returns what is seen from a view when the arm comes from random joints; `item` is a PRNG key and the view."""
+    key, view = item
+    return env.look(view, env.random_joints(key))[0]
+
+
+def camera_at(env: ViewSearchEnv, view: View, qpos: Array) -> Camera:
+    """Returns the wrist camera where the arm, coming from joints `qpos` (f32[nq]), reaches `view`."""
+    joints, _ = env.solve(view, qpos)
+    return env.stand(joints)[1]
 
 
 def initial_views(config: Config, band: Array) -> View:
@@ -82,39 +130,37 @@ def initial_views(config: Config, band: Array) -> View:
     Azimuths lie half a spacing off the axes, equally many in each quadrant; elevations step through 1/6, 3/6 and 5/6 of
     the band (f32[2] rad).
     """
-    number = jnp.arange(config.evaluation.num_initial_views)
+    number = jnp.arange(config.evaluation.num_initial_views, dtype=jnp.float32)
     azimuth = wrap_angle((number + 0.5) * (2.0 * jnp.pi / config.evaluation.num_initial_views))
     return View(azimuth, band[0] + (band[1] - band[0]) * (2.0 * (number % 3) + 1.0) / 6.0)
 
 
-def evaluate_search(key: Array, env: ViewSearchEnv, search: Any, search_config: Any) -> dict[str, Any]:
-    """Runs `search` from every initial view, several times each; see `evaluate` for the result."""
-    settings = env.config.evaluation
-    views = initial_views(env.config, env.reach.band)
-    views = jax.tree.map(lambda x: jnp.repeat(x, settings.num_runs), views)
-    target_key, trials_key = jax.random.split(key)
-    target, _ = env.look(protocol_target(env.config), env.random_joints(target_key))
-    run = functools.partial(run_trial, env=env, target=target, search=search, search_config=search_config)
-    keys = jax.random.split(trials_key, views.azimuth.shape[0])
-    samples = getattr(search_config, "num_samples", None) or search_config.population
-    return jax.lax.map(lambda xs: run(*xs), (keys, views), batch_size=max(1, settings.batch_size // samples))
+def search_trials(key: Array, env: ViewSearchEnv, search: Any, initial: Sight, target: Sight) -> SearchResult:
+    """Runs a search from each of the sights `initial` and returns the results, both with leading axis N.
 
+    Args:
+      key: PRNG key.
+      env: the task.
+      search: the searcher's function and its config.
+      initial: Sight of f32[N, ...].
+      target: Sight of the target.
+    """
+    function, config = search
+    num_samples = config.num_samples if isinstance(config, RandomSearchConfig) else config.population
 
-def run_trial(
-    key: Array, view: View, *, env: ViewSearchEnv, target: Sight, search: Any, search_config: Any
-) -> dict[str, Any]:
-    """Runs one search from `view` and measures where it ended."""
-    joints_key, search_key = jax.random.split(key)
-    initial, _ = env.look(view, env.random_joints(joints_key))
-    args = SearchArgs(
-        initial=initial.view,
-        band=env.reach.band,
-        threshold=jnp.asarray(env.config.env.threshold),
-        task=(initial.qpos, target.code),
-    )
-    result: SearchResult = search(search_key, functools.partial(score_view, env), args, search_config)
-    final, _ = env.look(result.view, initial.qpos)
-    return outcome(env, final, target, result) | {"initial_view": initial.view, "target_view": target.view}
+    def trial(item: tuple[Array, Sight]) -> SearchResult:
+        trial_key, start = item
+        args = SearchArgs(
+            initial=start.view,
+            band=env.reach.band,
+            threshold=jnp.asarray(env.config.env.threshold),
+            task=(start.qpos, target.code),
+            initial_score=cosine_similarity(start.code, target.code),
+        )
+        return function(trial_key, functools.partial(score_view, env), args, config)
+
+    keys = jax.random.split(key, initial.qpos.shape[0])
+    return map_batched(trial, (keys, initial), max(1, env.config.evaluation.batch_size // num_samples))
 
 
 def score_view(env: ViewSearchEnv, view: View, task: tuple[Array, Array]) -> Array:
@@ -130,10 +176,10 @@ def score_view(env: ViewSearchEnv, view: View, task: tuple[Array, Array]) -> Arr
     return jnp.where(is_reachable, cosine_similarity(sight.code, target_code), -jnp.inf)
 
 
-def outcome(env: ViewSearchEnv, final: Sight, target: Sight, result: SearchResult) -> dict[str, Any]:
-    """Returns the measures of a search that ended at `final`."""
-    rotation, frobenius, translation = pose_error(final.camera, target.camera)
-    is_success = result.score >= env.config.env.threshold
+def outcome(config: Config, result: SearchResult, camera: Camera, target: Camera) -> dict[str, Any]:
+    """Returns the measures of a search that ended at `camera`, when `target` was looked for."""
+    rotation, frobenius, translation = pose_error(camera, target)
+    is_success = result.score >= config.env.threshold
     return {
         "is_success": is_success,
         "evaluations": result.evaluations,
@@ -147,10 +193,9 @@ def outcome(env: ViewSearchEnv, final: Sight, target: Sight, result: SearchResul
     }
 
 
-def evaluate_policies(key: Array, env: ViewSearchEnv, state: TrainState) -> dict[str, Any]:
+def evaluate_policies(key: Array, env: ViewSearchEnv, state: TrainState, grid: Sight) -> dict[str, Any]:
     """Runs `num_episodes` episodes of every policy, initial views and targets random; see `evaluate` for the result."""
     settings = env.config.evaluation
-    grid = band_grid(env)
     seeds = jnp.arange(env.config.sac.num_seeds)
 
     def one_policy(xs: tuple[Array, Any]) -> dict[str, Any]:
@@ -167,26 +212,19 @@ def run_episode(key: Array, *, env: ViewSearchEnv, actor: Any, grid: Sight) -> d
     reset_key, search_key = jax.random.split(key)
     start = env.reset(reset_key)
     result, end = sac.search(search_key, start, env.step, actor, env.config.sac, env.config.env)
-    first, last = start.pipeline_state, end.pipeline_state
-    return outcome(env, last.sight, last.target, result) | {
+    first, last = episode_of(start), episode_of(end)
+    return outcome(env.config, result, last.sight.camera, last.target.camera) | {
         "initial_view": first.sight.view,
         "target_view": first.target.view,
         "steps_lower_bound": steps_lower_bound(first.sight.view, first.target, grid, env.reach.band, env.config),
     }
 
 
-def band_grid(env: ViewSearchEnv) -> Sight:
-    """Returns Sight of f32[N, ...]: the reachable band on a grid, each view with the arm in some configuration."""
+def band_grid(band: Array) -> View:
+    """Returns View of f32[N] rad: a grid over all azimuths and the elevations of `band` (f32[2] rad)."""
     azimuths = jnp.linspace(-jnp.pi, jnp.pi, GRID_AZIMUTHS, endpoint=False)
-    elevations = jnp.linspace(env.reach.band[0], env.reach.band[1], GRID_ELEVATIONS)
-    views = View(*(x.reshape(-1) for x in jnp.meshgrid(azimuths, elevations)))
-    look = functools.partial(_look_from_map, env)
-    return jax.lax.map(look, views, batch_size=env.config.evaluation.batch_size)
-
-
-def _look_from_map(env: ViewSearchEnv, view: View) -> Sight:
-    sight, _ = env.look(view, env.reach.qpos[nearest_cell(env.reach, view)])
-    return sight
+    elevations = jnp.linspace(band[0], band[1], GRID_ELEVATIONS)
+    return View(*(x.reshape(-1) for x in jnp.meshgrid(azimuths, elevations)))
 
 
 def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, config: Config) -> Array:
@@ -198,7 +236,7 @@ def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, co
     Args:
       initial: View of f32[] rad.
       target: Sight of the target.
-      grid: Sight of f32[N, ...], from `band_grid`.
+      grid: Sight of f32[N, ...], of the views of `band_grid`.
       band: f32[2] rad, the elevations that `grid` spans.
       config: the run's.
     """
@@ -206,7 +244,7 @@ def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, co
     half_elevation = 0.5 * (band[1] - band[0]) / (GRID_ELEVATIONS - 1)
     azimuth = jnp.abs(angle_difference(grid.view.azimuth, initial.azimuth)) - half_azimuth
     elevation = jnp.abs(grid.view.elevation - initial.elevation) - half_elevation
-    is_found = cosine_similarity(grid.code, target.code) >= config.env.threshold
+    is_found = cosine_similarity(grid.code, target.code[None]) >= config.env.threshold
     to_grid = jnp.where(is_found, jnp.maximum(azimuth, elevation), jnp.inf).min()
     to_target = jnp.maximum(
         jnp.abs(angle_difference(target.view.azimuth, initial.azimuth)),

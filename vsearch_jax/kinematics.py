@@ -1,8 +1,8 @@
 """Frames of a tree of hinges and slides, by one scan over the joints.
 
-This fills the fields of `mjx.kinematics` from the model's own constants. It does not call that function: on a chain as
-long as an arm's, XLA on CPU fuses its unrolled bodies into one expression and computes each body again for every use of
-it, down to the base (seen: 4 to 9 configurations a second; this scan: over 1,000,000).
+This fills the fields of `mjx.kinematics` from the model's own constants. It does not call that function: vmapped over
+64 configurations of the LWR and compiled for CPU (jax 0.9.2, mjx 3.17) it takes 0.14 s of processor time for each, this
+scan 2e-6 s. The likely reason: XLA fuses its unrolled chain of bodies and computes each body anew for every use of it.
 """
 
 from __future__ import annotations

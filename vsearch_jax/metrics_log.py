@@ -37,7 +37,7 @@ class MetricsLog:
 
     def __init__(self, run: Path, step: int) -> None:
         """Opens the logs in the folder `run` to go on at iteration `step`; what they hold of later ones is dropped."""
-        self.lines = [line for line in read_metrics(run) if True]
+        self.lines = [line for line in read_metrics(run) if line["iteration"] < step]
         self._path = run / METRICS
         write_text(self._path, "".join(json.dumps(line) + "\n" for line in self.lines))
         self._events = SummaryWriter(str(run / EVENTS), purge_step=step)

@@ -7,6 +7,9 @@ on from the last checkpoint, and metrics past it are dropped. So the run needs n
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
+import ctypes
+import gc
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -105,7 +108,7 @@ def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str,
       OSError: the disk is full or not writable.
     """
     check_finished(run, state, config)
-    jax.clear_caches()  # the compiled training, some GiB, is not needed any more
+    release_memory()  # of the compiled training, some GiB
     began = time.perf_counter()
     arrays = in_thread(evaluate, state, config)
     lines = read_metrics(run)
@@ -125,6 +128,14 @@ def check_finished(run: Path, state: TrainState, config: Config) -> None:
     step, end = int(state.step), config.num_iterations
     if step < end:
         raise RunError(f"{run} has done {step} of {end} iterations; finish it: vsearch train --out {run} --resume")
+
+
+def release_memory() -> None:
+    """Drops compiled programs and hands their memory back to the system, which glibc does not do by itself."""
+    jax.clear_caches()
+    gc.collect()
+    with contextlib.suppress(AttributeError, OSError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def in_thread(function: Callable[..., T], *arguments: Any) -> T:

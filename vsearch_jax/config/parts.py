@@ -98,7 +98,7 @@ class EncoderConfig:
     """Fraction of the pixels, those with the largest error, that enter the loss."""
     whitening_power: float = 0.0
     """Directions of the latent are scaled by their variance to minus this power: 0 leaves them, 0.5 whitens."""
-    pool_size: int = 1024
+    pool_size: int = 4096
     """Reachable views on which the whitening is fitted and from which training episodes start."""
 
     def __post_init__(self) -> None:

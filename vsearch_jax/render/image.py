@@ -28,9 +28,9 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
     """Returns what `camera` sees.
 
     Depth and geom_id are those of C MuJoCo's `mj_ray` through the pixels' centres; colours follow MuJoCo's light model,
-    evaluated in every pixel, with sharp shadows. There is no near or far plane. A surface seen from inside its solid is
-    lit as from outside. Derivatives are those of the geom that each pixel shows: finite, and blind to outlines and to
-    the edges of shadows.
+    evaluated in every pixel, with sharp shadows. There is no near or far plane. Light and camera belong outside of all
+    solids: a wall seen from inside is lit as from outside, and shadows in there are not right. Derivatives are those of
+    the geom that each pixel shows: finite, and blind to outlines and to the edges of shadows.
 
     Args:
       scene: RenderScene.

@@ -157,7 +157,7 @@ def is_lit(
     """Returns f32[H, W]: 0 where a geom stands between the pixel's surface and the light, else 1.
 
     A geom is convex, so it never shades the part of itself that faces the light: its own row is passed over, and a
-    surface needs no bias against itself.
+    surface needs no bias against itself. The light and what is seen lie outside of all other solids.
 
     Args:
       scene: shapes.

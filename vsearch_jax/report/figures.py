@@ -143,7 +143,7 @@ def policy_episodes(trials: Mapping[str, Any]) -> Figure:
     counts.set(
         xlabel="steps of an episode", ylabel="episodes (%)", title=f"{steps.size} episodes, views and targets random"
     )
-    counts.legend()
+    counts.legend(loc="upper right")
     errors = {
         rotation: ("rotational error (°)", np.rad2deg(trials["rotation_error"]), "rotation_error_deg_mean", "°"),
         translation: (
@@ -161,7 +161,7 @@ def policy_episodes(trials: Mapping[str, Any]) -> Figure:
         thesis = THESIS["sac"][key]
         axes.axvline(thesis, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis}{unit}")
         axes.set(xlabel=label, ylabel="episodes (%)")
-        axes.legend()
+        axes.legend(loc="upper right")
     return figure
 
 

@@ -33,7 +33,7 @@ class Measure(NamedTuple):
 
 
 MEASURES = (
-    Measure("success_rate", "success (%)", 100.0),
+    Measure("success_rate", "success (%)", 100.0, 2),
     Measure("episodes", "trials", digits=0),
     Measure("evaluations_mean", "images or steps, mean", digits=2),
     Measure("evaluations_p99", "images or steps, 99th percentile", digits=0),
@@ -84,7 +84,7 @@ def print_table(results: Mapping[str, Any], console: Console) -> None:
     console.print(table)
     for seed in results["sac"]["seeds"]:
         console.print(
-            f"SAC seed {seed['seed']}: success {100 * seed['success_rate']:.1f} %, "
+            f"SAC seed {seed['seed']}: success {100 * seed['success_rate']:.2f} %, "
             f"{seed['evaluations_mean']:.2f} steps (at least {seed['steps_lower_bound_mean']:.2f}), "
             f"rotational error {seed['rotation_error_deg_median']:.2f}° (median), "
             f"false positives {100 * seed['false_positive_rate']:.2f} %, "

@@ -26,6 +26,7 @@ from vsearch_jax.search.common import (
     ScoreFn,
     SearchArgs,
     add_generation,
+    initial_score,
     is_running,
     start_record,
     to_result,
@@ -87,7 +88,7 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: CMAESConfig)
     with _evosax_promotion():
         params = algorithm.default_params.replace(std_init=jnp.asarray(sigma, jnp.float32))
     carry = _Carry(
-        record=start_record(args.initial, score_fn(args.initial, args.task), config.max_generations),
+        record=start_record(args.initial, initial_score(score_fn, args), config.max_generations),
         strategy=_start(algorithm, params, _to_units(args.initial, args.band)),
         run_fitness=jnp.float32(jnp.inf),
         run_point=_to_units(args.initial, args.band),
@@ -111,7 +112,7 @@ def _generation(key: Array, score_fn: ScoreFn, args: SearchArgs, method: tuple[C
     best = jnp.argmin(fitness)
     stalled = jnp.where(fitness[best] < carry.run_fitness - _STALL_IMPROVEMENT, 0, carry.stalled + 1)
     is_stalled = stalled >= _STALL_GENERATIONS
-    run_point = jnp.where(fitness[best] < carry.run_fitness, population[best], carry.run_point)
+    run_point = jax.lax.select(fitness[best] < carry.run_fitness, population[best], carry.run_point)
     run_fitness = jnp.minimum(fitness[best], carry.run_fitness)
     random_point = jax.random.uniform(restart_key, (2,), minval=jnp.array([-2.0, -1.0]), maxval=jnp.array([2.0, 1.0]))
 

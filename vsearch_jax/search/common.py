@@ -25,12 +25,14 @@ class SearchArgs:
       band: f32[2] rad, lowest and highest elevation to search.
       threshold: f32[], the score at which the search ends.
       task: any pytree, handed to `score_fn` untouched: the scene, encoder and target code, for instance.
+      initial_score: f32[], the score of the initial view where its image has been taken already; else None.
     """
 
     initial: View
     band: Array
     threshold: Array
     task: Any
+    initial_score: Array | None = None
 
 
 @flax.struct.dataclass
@@ -52,6 +54,11 @@ class Record:
     evaluations: Array
     unreachable: Array
     generation: Array
+
+
+def initial_score(score_fn: ScoreFn, args: SearchArgs) -> Array:
+    """Returns the score f32[] of the initial view."""
+    return score_fn(args.initial, args.task) if args.initial_score is None else args.initial_score
 
 
 def start_record(view: View, score: Array, max_generations: int) -> Record:

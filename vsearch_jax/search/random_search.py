@@ -16,6 +16,7 @@ from vsearch_jax.search.common import (
     SearchArgs,
     add_generation,
     fold_into_band,
+    initial_score,
     is_running,
     start_record,
     to_result,
@@ -39,7 +40,7 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearch
     Returns:
       SearchResult with best_scores f32[config.max_epochs].
     """
-    record = start_record(args.initial, score_fn(args.initial, args.task), config.max_epochs)
+    record = start_record(args.initial, initial_score(score_fn, args), config.max_epochs)
     body = functools.partial(_epoch, key, score_fn, args, config)
     record = jax.lax.while_loop(lambda record: is_running(record, args.threshold), body, record)
     return to_result(record)
