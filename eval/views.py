@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +38,7 @@ def main(path: str) -> None:
             axes = figure.add_axes((column / len(AZIMUTHS_DEG), 1 - (row + 1) / len(names), 1 / 8, 1 / len(names)))
             axes.imshow(np.clip(image, 0, 1))
             axes.set_axis_off()
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
 

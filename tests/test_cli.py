@@ -41,8 +41,9 @@ def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 def program(*arguments: str) -> dict[str, Any]:
-    """What subprocess needs to run a program: without the cache, whose entries XLA comments on."""
+    """What subprocess needs to run a program; XLA is not to comment on the cache's entries nor on a slow machine."""
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    environment["TF_CPP_MIN_LOG_LEVEL"] = "3"
     return {"args": [sys.executable, *arguments], "env": environment, "text": True}
 
 

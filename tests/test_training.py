@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vsearch_jax as vs
-from vsearch_jax import training
+from vsearch_jax import checkpoint, training
 
 CONFIG = vs.Config.preset("smoke")
 
@@ -93,6 +93,19 @@ def test_after_the_end_nothing_changes(chunked):
     assert (np.asarray(metrics["stage"]) == -1).all()
     for path, leaf in arrays(state).items():
         np.testing.assert_array_equal(leaf, before[path], err_msg=path)
+
+
+def test_a_restored_run_ends_bit_for_bit_as_an_uninterrupted_one(chunked, tmp_path):
+    state = vs.init(jax.random.key(0), CONFIG)
+    for _ in range(2):
+        state, _ = vs.train(state, CONFIG)
+    checkpoint.save(tmp_path, state, CONFIG)
+    template = jax.eval_shape(lambda key: vs.init(key, CONFIG), jax.random.key(0))
+    restored = checkpoint.restore(tmp_path, template, CONFIG)
+    for _ in range(2):
+        restored, _ = vs.train(restored, CONFIG)
+    for path, expected in arrays(chunked[0]).items():
+        np.testing.assert_array_equal(arrays(restored)[path], expected, err_msg=path)
 
 
 def test_the_seed_matters(chunked):

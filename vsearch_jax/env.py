@@ -16,7 +16,7 @@ from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import Config
 from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
 from vsearch_jax.planning import nearest_cell, reachability_map, solve_view, start_limits
-from vsearch_jax.scene import build_scene
+from vsearch_jax.scene import SceneError, build_scene
 from vsearch_jax.types import Camera, EncoderState, EpisodeState, Image, ReachabilityMap, Sight, View
 
 
@@ -52,6 +52,8 @@ class ViewSearchEnv(Env):
         self.center = jnp.asarray(self.scene.center, jnp.float32)
         self.arm = build_arm(self.scene)
         self.render_scene = render.compile_scene(self.scene.mj_model)
+        if not set(self.scene.object_geom_ids) & set(self.render_scene.geom_ids):
+            raise SceneError(f"object {self.config.scene.object!r} has no visible geom in the groups 0 to 2")
         self.fovy = math.radians(float(self.scene.mj_model.cam_fovy[self.scene.camera_id]))
         self.encoder = encoder if encoder is not None else encoders.init(jax.random.key(0), self.config)
         self.reach = reach if reach is not None else jax.jit(self.map_reach)(jax.random.key(0))

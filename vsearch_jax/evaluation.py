@@ -11,16 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from vsearch_jax.bound import band_grid, steps_lower_bound
 from vsearch_jax.config import Config, ConfigError, RandomSearchConfig
 from vsearch_jax.env import ViewSearchEnv, episode_of, pose_error
-from vsearch_jax.geometry import angle_difference, cosine_similarity, wrap_angle
+from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.search import SearchArgs, cma_es, random_search, sac
 from vsearch_jax.types import Camera, ReachabilityMap, SearchResult, Sight, TrainState, View
 
 FALSE_POSITIVE_DEG = 10.0
 """A found view whose rotation is further than this from the target's is a false positive (SPEC.md 4)."""
-GRID_AZIMUTHS, GRID_ELEVATIONS = 144, 13
-"""Views on which the lower bound of an episode's steps looks for the threshold: every 2.5 degrees."""
 
 
 def evaluate(state: TrainState, config: Config) -> dict[str, Any]:
@@ -76,7 +75,11 @@ def _evaluate(state: TrainState, config: Config) -> dict[str, Any]:
     known = (views, band_grid(env.reach.band), jax.tree.map(lambda x: x[None], protocol_target(config)))
     known = jax.tree.map(lambda *x: jnp.concatenate(x), *known)
     keys = jax.random.split(survey_key, known.azimuth.shape[0])
-    sights = map_batched(functools.partial(look_from_anywhere, env), (keys, known), config.evaluation.batch_size)
+    look = functools.partial(look_from_anywhere, env)
+    sights, is_reachable = map_batched(look, (keys, known), config.evaluation.batch_size)
+    # A code that nothing matches stands for a view that is not reached.
+    code = jnp.where(is_reachable[:, None], sights.code, 0.0)
+    sights = sights.replace(code=code)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     initial, grid, target = (jax.tree.map(lambda x, n=n: x[n], sights) for n in _split(num_trials))
 
     results = {
@@ -112,10 +115,15 @@ def map_batched(function: Any, xs: Any, batch_size: int) -> Any:
     return jax.tree.map(lambda x: x[:count], results)
 
 
-def look_from_anywhere(env: ViewSearchEnv, item: tuple[Array, View]) -> Sight:
-    """Returns what is seen from a view when the arm comes from random joints; `item` is a PRNG key and the view."""
+def look_from_anywhere(env: ViewSearchEnv, item: tuple[Array, View]) -> tuple[Sight, Array]:
+    """Returns what is seen from a view when the arm comes from random joints, and bool[] is_reachable.
+
+    Args:
+      env: the task.
+      item: PRNG key and View of f32[] rad.
+    """
     key, view = item
-    return env.look(view, env.random_joints(key))[0]
+    return env.look(view, env.random_joints(key))
 
 
 def camera_at(env: ViewSearchEnv, view: View, qpos: Array) -> Camera:
@@ -220,40 +228,6 @@ def run_episode(key: Array, *, env: ViewSearchEnv, actor: Any, grid: Sight) -> d
     }
 
 
-def band_grid(band: Array) -> View:
-    """Returns View of f32[N] rad: a grid over all azimuths and the elevations of `band` (f32[2] rad)."""
-    azimuths = jnp.linspace(-jnp.pi, jnp.pi, GRID_AZIMUTHS, endpoint=False)
-    elevations = jnp.linspace(band[0], band[1], GRID_ELEVATIONS)
-    return View(*(x.reshape(-1) for x in jnp.meshgrid(azimuths, elevations)))
-
-
-def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, config: Config) -> Array:
-    """Returns i32[], fewer steps than which no policy can need: a bound for one episode.
-
-    A step changes azimuth and elevation by at most `action_scale_deg` each. The episode ends at the nearest view that
-    meets the threshold, which need not be the target; it lies within half a spacing of one of the `grid`'s views.
-
-    Args:
-      initial: View of f32[] rad.
-      target: Sight of the target.
-      grid: Sight of f32[N, ...], of the views of `band_grid`.
-      band: f32[2] rad, the elevations that `grid` spans.
-      config: the run's.
-    """
-    half_azimuth = jnp.pi / GRID_AZIMUTHS
-    half_elevation = 0.5 * (band[1] - band[0]) / (GRID_ELEVATIONS - 1)
-    azimuth = jnp.abs(angle_difference(grid.view.azimuth, initial.azimuth)) - half_azimuth
-    elevation = jnp.abs(grid.view.elevation - initial.elevation) - half_elevation
-    is_found = cosine_similarity(grid.code, target.code[None]) >= config.env.threshold
-    to_grid = jnp.where(is_found, jnp.maximum(azimuth, elevation), jnp.inf).min()
-    to_target = jnp.maximum(
-        jnp.abs(angle_difference(target.view.azimuth, initial.azimuth)),
-        jnp.abs(target.view.elevation - initial.elevation),
-    )
-    steps = jnp.minimum(to_grid, to_target) / math.radians(config.env.action_scale_deg)
-    return jnp.maximum(jnp.ceil(steps - 1e-5), 1.0).astype(jnp.int32)
-
-
 @functools.partial(jax.jit, static_argnames="config")
 def record_search(state: TrainState, config: Config) -> dict[str, Array]:
     """Returns one search of the first policy in pictures: from the far side of the object to the protocol's target.
@@ -264,7 +238,7 @@ def record_search(state: TrainState, config: Config) -> dict[str, Array]:
     """
     env = ViewSearchEnv(config, state.encoder, state.reach)
     actor = jax.tree.map(lambda x: x[0], state.sac.actor)
-    initial_key, target_key = jax.random.split(state.key)
+    initial_key, target_key = jax.random.split(jax.random.fold_in(state.key, 2**31 - 2))
     target_view = protocol_target(config)
     far_side = View(wrap_angle(target_view.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))
     initial, _ = env.look(far_side, env.random_joints(initial_key))

@@ -69,7 +69,10 @@ def read_config(run: Path) -> Config:
         raise ConfigError(f"{path} is not JSON ({error}); restore it, or train into another folder") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path} holds no JSON object; restore it, or train into another folder")
-    return Config.from_dict(values)
+    try:
+        return Config.from_dict(values)
+    except (ValueError, TypeError, AttributeError) as error:  # out of its range, or of another type
+        raise ConfigError(f"{path}: {error}; restore it, or train into another folder") from error
 
 
 def write_text(path: Path, text: str) -> None:

@@ -88,12 +88,23 @@ def finish_training(run: Path, state: TrainState, config: Config, on_chunk: OnCh
         new_step = int(state.step)
         # The last chunk may be shorter than its arrays.
         columns = {name: np.asarray(column)[: new_step - step] for name, column in metrics.items()}
+        check_finite(run, columns, step)
         log.append(columns, step, seconds)
         checkpoint.save(run, state, config)
         on_chunk(new_step, seconds, log.lines[step - new_step :])
         step = new_step
     log.close()
     return state
+
+
+def check_finite(run: Path, columns: Mapping[str, np.ndarray], step: int) -> None:
+    """Raises RunError where the training diverged in a chunk that began at iteration `step`; nothing of it is saved."""
+    for stage, name in enumerate(("encoder_loss", "reward")):
+        if not np.isfinite(columns[name][columns["stage"] == stage]).all():
+            raise RunError(
+                f"{run}: {name} is not finite after iteration {step}; the last checkpoint is good: "
+                f"start anew with a smaller {('encoder', 'sac')[stage]}.learning-rate"
+            )
 
 
 def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str, Any]:

@@ -15,7 +15,7 @@ class SceneConfig:
     arm: str = "lwr"
     """A name in xml/arm, or the path of an MJCF file with a site `tcp` and a camera `wrist`."""
     object: str = "teapot"
-    """A name in xml/objects, or the path of an MJCF file with one body or of an OBJ or STL mesh in metres."""
+    """A name in xml/objects, or the path of an MJCF file with one body of primitive geoms."""
     mount_height: float = 1.355
     """Height in m of the arm's base above the table; the arm hangs from it."""
     radius: float = 0.35

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 
 class ConfigError(ValueError):
     """A field of the config is out of its range; the message names field, value and range."""
@@ -17,7 +19,7 @@ def require(owner: object, name: str, is_valid: bool, allowed: str) -> None:
 def require_positive(owner: object, *names: str) -> None:
     """Raises ConfigError where one of the fields `names` of `owner` is not above 0."""
     for name in names:
-        require(owner, name, getattr(owner, name) > 0, "greater than 0")
+        require(owner, name, 0 < getattr(owner, name) < math.inf, "greater than 0, finite")
 
 
 def require_unit(owner: object, *names: str) -> None:

@@ -11,6 +11,7 @@ over its samples; callers vmap or map `search` over trials. The image of the ini
 `sac` holds the policy. It keeps its own state between steps, so its `search` rolls out an environment's step function.
 """
 
+from vsearch_jax.search import cma_es, random_search, sac
 from vsearch_jax.search.common import ScoreFn, SearchArgs
 
-__all__ = ["ScoreFn", "SearchArgs"]
+__all__ = ["ScoreFn", "SearchArgs", "cma_es", "random_search", "sac"]

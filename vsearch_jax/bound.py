@@ -1,0 +1,49 @@
+"""How few steps an episode can take, whatever the policy."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+from jax import Array
+
+from vsearch_jax.config import Config
+from vsearch_jax.geometry import angle_difference, cosine_similarity
+from vsearch_jax.types import Sight, View
+
+GRID_AZIMUTHS, GRID_ELEVATIONS = 144, 13
+"""Views on which the lower bound of an episode's steps looks for the threshold: every 2.5 degrees."""
+
+
+def band_grid(band: Array) -> View:
+    """Returns View of f32[N] rad: a grid over all azimuths and the elevations of `band` (f32[2] rad)."""
+    azimuths = jnp.linspace(-jnp.pi, jnp.pi, GRID_AZIMUTHS, endpoint=False)
+    elevations = jnp.linspace(band[0], band[1], GRID_ELEVATIONS)
+    return View(*(x.reshape(-1) for x in jnp.meshgrid(azimuths, elevations)))
+
+
+def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, config: Config) -> Array:
+    """Returns i32[], fewer steps than which no policy can need: a bound for one episode.
+
+    A step changes azimuth and elevation by at most `action_scale_deg` each. The episode ends at the nearest view that
+    meets the threshold, which need not be the target; it lies within half a spacing of one of the `grid`'s views.
+
+    Args:
+      initial: View of f32[] rad.
+      target: Sight of the target.
+      grid: Sight of f32[N, ...], of the views of `band_grid`.
+      band: f32[2] rad, the elevations that `grid` spans.
+      config: the run's.
+    """
+    half_azimuth = jnp.pi / GRID_AZIMUTHS
+    half_elevation = 0.5 * (band[1] - band[0]) / (GRID_ELEVATIONS - 1)
+    azimuth = jnp.abs(angle_difference(grid.view.azimuth, initial.azimuth)) - half_azimuth
+    elevation = jnp.abs(grid.view.elevation - initial.elevation) - half_elevation
+    is_found = cosine_similarity(grid.code, target.code[None]) >= config.env.threshold
+    to_grid = jnp.where(is_found, jnp.maximum(azimuth, elevation), jnp.inf).min()
+    to_target = jnp.maximum(
+        jnp.abs(angle_difference(target.view.azimuth, initial.azimuth)),
+        jnp.abs(target.view.elevation - initial.elevation),
+    )
+    steps = jnp.minimum(to_grid, to_target) / math.radians(config.env.action_scale_deg)
+    return jnp.maximum(jnp.ceil(steps - 1e-5), 1.0).astype(jnp.int32)
