@@ -18,7 +18,7 @@ from vsearch_jax.config import Config
 from vsearch_jax.training import POLICY_METRICS
 from vsearch_jax.types import ReachabilityMap
 
-CHUNK_SECONDS = 0.3
+CHUNK_SECONDS = 3.0  # a test has so long to interrupt a chunk, on a machine that stalls too
 
 
 @flax.struct.dataclass

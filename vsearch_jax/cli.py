@@ -212,7 +212,8 @@ def _import_runner() -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line and exits: 0 when done, 2 after an error of the user's, 130 when interrupted."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGTERM, signal.SIGINT):  # shells start background jobs with SIGINT ignored
+        signal.signal(number, signal.default_int_handler)
     command = None
     try:
         command = parse(sys.argv[1:] if arguments is None else arguments)
