@@ -14,6 +14,7 @@ from rich.console import Console
 from made_up import evaluation, reach, search, trials
 from vsearch_jax import report
 from vsearch_jax.config import Config
+from vsearch_jax.report.page import CAPTIONS
 from vsearch_jax.report.table import rows
 
 CONFIG = Config.preset("smoke")
@@ -126,8 +127,11 @@ def test_figures_stand_runs_that_found_nothing(arrays: dict[str, Any]) -> None:
     nothing = {name: values | {"is_success": np.zeros_like(values["is_success"])} for name, values in arrays.items()}
     summary = report.results(nothing, CONFIG, {})
     no_band = dataclasses.replace(reach(), is_reachable=jnp.zeros((12, 7), bool))
-    for picture in report.draw(summary, nothing, search(), no_band, [], CONFIG).values():
+    pictures = report.draw(summary, nothing, search(), no_band, [], CONFIG)
+    assert set(pictures) == set(CAPTIONS)
+    for picture in pictures.values():
         picture.canvas.draw()
+        assert picture.axes
 
 
 def test_search_strip_shows_every_step_and_the_target() -> None:
