@@ -16,7 +16,7 @@ import standin
 from vsearch_jax import checkpoint, cli, runner
 from vsearch_jax.config import Config
 from vsearch_jax.metrics_log import STAGES, MetricsLog, read_metrics
-from vsearch_jax.run_folder import read_config
+from vsearch_jax.run_folder import RunError, held, read_config, read_seed
 
 ROOT = Path(__file__).resolve().parent.parent
 STANDIN = str(ROOT / "tests" / "standin.py")
@@ -235,13 +235,77 @@ def test_an_interrupt_says_how_to_go_on(quick: None, tmp_path: Path, signal_: si
     process = subprocess.Popen(**program(STANDIN, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     wait_for_step(out, 6, process)
     process.send_signal(signal_)
-    _, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=120)
     assert process.returncode == 130
+    assert "stopping after this chunk" in output
     step = checkpoint.latest_step(out)
+    assert step >= 12, "the chunk that was running when the signal came is saved"
+    assert not (out / "results.json").exists()
     line = f"vsearch: interrupted; {step} iterations are saved. Go on with: vsearch train --out {out} --resume"
     assert errors.strip() == line
     cli.main([*command, "--resume"])
     assert checkpoint.latest_step(out) == Config.preset("smoke").num_iterations
+
+
+def test_a_second_interrupt_leaves_the_chunk(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = program(STANDIN, "train", "--preset", "smoke", "--out", str(out))
+    process = subprocess.Popen(**command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=1)
+    assert process.stdout is not None
+    assert "6/24" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    assert "stopping after this chunk" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "6 iterations are saved" in errors and checkpoint.latest_step(out) == 6
+
+
+def test_a_folder_in_use_is_refused(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    command = ["train", "--preset", "smoke", "--out", str(out)]
+    with held(out):
+        assert "another process is at work in" in fails(capsys, *command)
+        assert not any(out.iterdir())
+        with pytest.raises(RunError, match="another process"), held(out):
+            pass
+    cli.main(command)  # the hold ends with its block
+    with held(out):
+        assert "another process is at work in" in fails(capsys, *command, "--resume")
+        assert "another process is at work in" in fails(capsys, "eval", str(out))
+
+
+def test_the_seed_is_kept(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    cli.main(["train", "--preset", "smoke", "--out", str(out), "--seed", "7"])
+    assert read_seed(out) == 7
+    assert json.loads((out / "results.json").read_text())["seed"] == 7
+    assert "has seed 7" in fails(capsys, "train", "--out", str(out), "--resume", "--seed", "8")
+    cli.main(["train", "--out", str(out), "--resume", "--evaluation.num-runs", "2"])
+    assert (read_seed(out), read_config(out).evaluation.num_runs) == (7, 2)
+
+
+def test_a_damaged_line_of_metrics_is_named(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    cli.main(["train", "--preset", "smoke", "--out", str(out)])
+    lines = (out / "metrics.jsonl").read_text().splitlines()
+    for damage in ("\0\0", "3", '{"iteration": 3}'):
+        (out / "metrics.jsonl").write_text("\n".join([*lines[:3], damage, *lines[4:]]) + "\n")
+        assert "metrics.jsonl: line 4 is damaged" in fails(capsys, "eval", str(out))
+
+
+@pytest.mark.parametrize(("name", "row"), [("encoder_loss", 2), ("reward", 9), ("actor_loss", 20), ("critic_loss", 20)])
+def test_a_diverged_run_is_stopped(tmp_path: Path, name: str, row: int) -> None:
+    config = Config.preset("smoke")  # 8 encoder updates, 4 policy iterations of warm-up, 12 with updates
+    number = np.arange(config.num_iterations)
+    first = {"encoder_loss": 0, "reward": 8, "actor_loss": 12, "critic_loss": 12}
+    columns = {key: np.where(number >= start, 1.0, np.nan) for key, start in first.items()}
+    columns["stage"] = (number >= 8).astype(np.int32)
+    runner.check_finite(tmp_path, columns, 0, config)
+    columns[name][row] = np.nan
+    with pytest.raises(RunError, match=f"{name} is not finite .*learning-rate"):
+        runner.check_finite(tmp_path, columns, 0, config)
 
 
 def test_log_drops_what_lies_past_the_step_it_goes_on_from(tmp_path: Path) -> None:

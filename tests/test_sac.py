@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import probes
-from vsearch_jax.config import EnvConfig, SACConfig
-from vsearch_jax.search import sac
+from vsearch_jax.config import Config, EnvConfig, SACConfig
+from vsearch_jax.search import SearchArgs, sac
 from vsearch_jax.types import SACState, Transition
 
 SMALL = SACConfig(hidden_sizes=(8, 8), batch_size=4, discount=0.9)
@@ -294,13 +294,24 @@ def policy():
 @functools.partial(jax.jit, static_argnums=0)
 def episodes(env, actor, keys):
     starts = jax.vmap(env.reset)(keys)
-    return starts, *jax.vmap(lambda start: sac.search(jax.random.key(9), start, env.step, actor, TASK, ENV))(starts)
+    config = Config(sac=TASK, env=ENV)
+
+    def run(start):
+        args = SearchArgs(
+            initial=start.pipeline_state.sight.view,
+            band=jnp.array(probes.BAND),
+            threshold=jnp.float32(ENV.threshold),
+            task=sac.PolicyTask(actor, start),
+        )
+        return sac.search(jax.random.key(9), env.step, args, config)
+
+    return starts, jax.vmap(run)(starts)
 
 
 def test_the_policy_finds_any_target_in_few_more_steps_than_the_bound(policy):
     env = probes.SphereEnv(ENV)
-    starts, result, ends = episodes(env, policy, jax.random.split(jax.random.key(7), 500))
-    is_found = np.asarray(result.score) >= ENV.threshold
+    starts, result = episodes(env, policy, jax.random.split(jax.random.key(7), 500))
+    ends, is_found = result.end, np.asarray(result.score) >= ENV.threshold
     assert is_found.mean() >= 0.93
     initial, target = starts.pipeline_state.sight.view, starts.pipeline_state.target.view
     bound = jax.vmap(env.steps_lower_bound)(initial, target)

@@ -26,7 +26,8 @@ def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, co
     """Returns i32[], fewer steps than which no policy can need: a bound for one episode.
 
     A step changes azimuth and elevation by at most `action_scale_deg` each. The episode ends at the nearest view that
-    meets the threshold, which need not be the target; it lies within half a spacing of one of the `grid`'s views.
+    meets the threshold, which need not be the target. A whole spacing of the grid is subtracted: views within it of one
+    of the `grid`'s that meets the threshold may meet it too.
 
     Args:
       initial: View of f32[] rad.
@@ -35,10 +36,10 @@ def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, co
       band: f32[2] rad, the elevations that `grid` spans.
       config: the run's.
     """
-    half_azimuth = jnp.pi / GRID_AZIMUTHS
-    half_elevation = 0.5 * (band[1] - band[0]) / (GRID_ELEVATIONS - 1)
-    azimuth = jnp.abs(angle_difference(grid.view.azimuth, initial.azimuth)) - half_azimuth
-    elevation = jnp.abs(grid.view.elevation - initial.elevation) - half_elevation
+    azimuth_spacing = 2.0 * jnp.pi / GRID_AZIMUTHS
+    elevation_spacing = (band[1] - band[0]) / (GRID_ELEVATIONS - 1)
+    azimuth = jnp.abs(angle_difference(grid.view.azimuth, initial.azimuth)) - azimuth_spacing
+    elevation = jnp.abs(grid.view.elevation - initial.elevation) - elevation_spacing
     is_found = cosine_similarity(grid.code, target.code[None]) >= config.env.threshold
     to_grid = jnp.where(is_found, jnp.maximum(azimuth, elevation), jnp.inf).min()
     to_target = jnp.maximum(

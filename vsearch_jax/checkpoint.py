@@ -21,12 +21,10 @@ import orbax.checkpoint as ocp
 import tensorstore
 
 from vsearch_jax.config import Config
+from vsearch_jax.run_folder import CHECKPOINTS
 
 NUM_KEPT = 2
 """Checkpoints kept in a run's folder: the last one and the one before."""
-
-CHECKPOINTS = "checkpoints"
-"""Subfolder of a run's folder."""
 
 _ABSENT = "absent"
 _UNTRAINED = ("random_search", "cma_es", "evaluation", "num_chunks")
@@ -46,6 +44,7 @@ def save(run: Path, state: Any, config: Config) -> None:
       config: the run's config, kept beside the arrays.
 
     Raises:
+      CheckpointError: the folder holds a checkpoint of this step or a later one.
       OSError: the disk is full or not writable.
     """
     leaves = _named_leaves(state)
@@ -58,9 +57,11 @@ def save(run: Path, state: Any, config: Config) -> None:
     arguments = ocp.args.Composite(state=ocp.args.StandardSave(_not_empty(stored)), about=ocp.args.JsonSave(about))
     with _one_error(), _manager(run) as manager:
         try:
-            manager.save(int(state.step), args=arguments)
+            is_saved = manager.save(int(state.step), args=arguments)
         except ValueError as error:  # tensorstore reports what the disk refused as a ValueError
             raise OSError(f"cannot write a checkpoint to {run / CHECKPOINTS}: {_first_line(error)}") from error
+    if not is_saved:  # orbax leaves a step alone that is not past the last one
+        raise CheckpointError(f"{run / CHECKPOINTS} holds step {latest_step(run)} already; train into another folder")
 
 
 def latest_step(run: Path) -> int | None:

@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from vsearch_jax.config import PRESETS, Config
-from vsearch_jax.run_folder import claim, read_config
+from vsearch_jax.run_folder import RunError, claim, held, read_config, read_seed
 
 DEFAULT_PRESET = "cpu"
 INTERRUPTED = 130
@@ -47,7 +47,7 @@ class Train:
     """Folder of the run; it must not exist, or hold nothing, unless --resume is given."""
     preset: _Preset = None
     """Where every value below starts from."""
-    seed: int = 0
+    seed: Annotated[int | None, _option("INT", "0")] = None
     """Of all random numbers of the run."""
     object: _Name = None
     """Short for --scene.object: a name (see xml/objects) or the path of an MJCF file of primitive geoms."""
@@ -160,24 +160,34 @@ def run_train(command: Train) -> None:
     runner = _import_runner()
     from vsearch_jax.progress import training_progress
 
-    console, config = Console(), command.config
-    with console.status("building the scene, mapping what the arm can reach"):
-        if command.resume:
-            state = runner.resume(command.out, config)
-        else:
-            state = runner.start(command.out, config, command.seed)
-    with training_progress(console, config, int(state.step)) as update:
-        state = runner.finish_training(command.out, state, config, update)
-    _evaluate(command.out, state, config, console)
+    console, config, run = Console(), command.config, command.out
+    if not command.resume:
+        claim(run)
+    with held(run):
+        with console.status("building the scene, mapping what the arm can reach"):
+            state = _resume(command) if command.resume else runner.start(run, config, command.seed or 0)
+        with training_progress(console, config, int(state.step)) as progress:
+            state = runner.finish_training(run, state, config, progress.update, progress.stopping)
+        _evaluate(run, state, config, console)
+
+
+def _resume(command: Train) -> Any:
+    if command.seed is not None and command.seed != read_seed(command.out):
+        raise RunError(
+            f"the run in {command.out} has seed {read_seed(command.out)}; leave --seed out to go on with it, or name "
+            "another folder with --out"
+        )
+    return _import_runner().resume(command.out, command.config)
 
 
 def run_eval(command: Eval) -> None:
     """Runs `vsearch eval`."""
     runner = _import_runner()
     console, config = Console(), read_config(command.run)
-    with console.status("reading the run"):
-        state = runner.resume(command.run, config)
-    _evaluate(command.run, state, config, console)
+    with held(command.run):
+        with console.status("reading the run"):
+            state = runner.resume(command.run, config)
+        _evaluate(command.run, state, config, console)
 
 
 def _evaluate(run: Path, state: Any, config: Config, console: Console) -> None:

@@ -7,17 +7,21 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State
 from jax import Array
 
 from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
-from vsearch_jax.config import Config
+from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
 from vsearch_jax.planning import nearest_cell, reachability_map, solve_view, start_limits
 from vsearch_jax.scene import SceneError, build_scene
 from vsearch_jax.types import Camera, EncoderState, EpisodeState, Image, ReachabilityMap, Sight, View
+
+_REACH_SEED = 20_191_201
+"""Of the starts from which the reachability map is solved: the same map in every run, whatever the run's seed."""
 
 
 class ViewSearchEnv(Env):
@@ -46,6 +50,7 @@ class ViewSearchEnv(Env):
 
         Raises:
           SceneError: arm or object can't be loaded.
+          ConfigError: the arm reaches no elevation at every azimuth (not under a trace, where nothing is known yet).
         """
         self.config = config if config is not None else Config.preset("cpu")
         self.scene = build_scene(self.config.scene)
@@ -56,7 +61,8 @@ class ViewSearchEnv(Env):
             raise SceneError(f"object {self.config.scene.object!r} has no visible geom in the groups 0 to 2")
         self.fovy = math.radians(float(self.scene.mj_model.cam_fovy[self.scene.camera_id]))
         self.encoder = encoder if encoder is not None else encoders.init(jax.random.key(0), self.config)
-        self.reach = reach if reach is not None else jax.jit(self.map_reach)(jax.random.key(0))
+        self.reach = reach if reach is not None else jax.jit(self.map_reach)(jax.random.key(_REACH_SEED))
+        check_band(self.reach, self.config)
 
     @property
     def observation_size(self) -> int:
@@ -191,6 +197,19 @@ class ViewSearchEnv(Env):
         """Returns MJX data of the arm at joints `qpos` (f32[nq]) and its wrist camera."""
         data = forward_kinematics(self.arm, qpos)
         return data, render.camera_from_pose(camera_pose(self.arm, data), self.fovy)
+
+
+def check_band(reach: ReachabilityMap, config: Config) -> None:
+    """Checks that there is a band to search; does nothing under a trace.
+
+    Raises:
+      ConfigError: the arm reaches no elevation at every azimuth.
+    """
+    if not isinstance(reach.band, jax.core.Tracer) and np.isnan(reach.band).any():
+        raise ConfigError(
+            f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
+            f"at every azimuth around object {config.scene.object!r}; try another mount_height or radius"
+        )
 
 
 def episode_of(state: State) -> EpisodeState:

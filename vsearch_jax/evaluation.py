@@ -13,7 +13,7 @@ from jax import Array
 
 from vsearch_jax.bound import band_grid, steps_lower_bound
 from vsearch_jax.config import Config, ConfigError, RandomSearchConfig
-from vsearch_jax.env import ViewSearchEnv, episode_of, pose_error
+from vsearch_jax.env import ViewSearchEnv, check_band, episode_of, pose_error
 from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.search import SearchArgs, cma_es, random_search, sac
 from vsearch_jax.types import Camera, ReachabilityMap, SearchResult, Sight, TrainState, View
@@ -49,12 +49,8 @@ def check_target(reach: ReachabilityMap, config: Config) -> None:
     Raises:
       ConfigError: the arm reaches no elevation at every azimuth, or not the target's.
     """
+    check_band(reach, config)
     low, high = np.rad2deg(np.asarray(reach.band))
-    if np.isnan(low):
-        raise ConfigError(
-            f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
-            f"at every azimuth around object {config.scene.object!r}; try another mount_height or radius"
-        )
     elevation = config.evaluation.target_elevation_deg
     if not low - 1e-3 <= elevation <= high + 1e-3:
         raise ConfigError(
@@ -81,12 +77,14 @@ def _evaluate(state: TrainState, config: Config) -> dict[str, Any]:
     code = jnp.where(is_reachable[:, None], sights.code, 0.0)
     sights = sights.replace(code=code)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     initial, grid, target = (jax.tree.map(lambda x, n=n: x[n], sights) for n in _split(num_trials))
+    similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(initial.code, target.code)
+    starts = (initial, jnp.where(is_reachable[:num_trials], similarity, -jnp.inf))
 
     results = {
         "random_search": search_trials(
-            random_search_key, env, (random_search.search, config.random_search), initial, target
+            random_search_key, env, (random_search.search, config.random_search), starts, target
         ),
-        "cma_es": search_trials(cma_es_key, env, (cma_es.search, config.cma_es), initial, target),
+        "cma_es": search_trials(cma_es_key, env, (cma_es.search, config.cma_es), starts, target),
     }
     ends = jax.tree.map(lambda *x: jnp.concatenate(x), *(result.view for result in results.values()))
     cameras = jax.vmap(functools.partial(camera_at, env))(ends, jnp.tile(initial.qpos, (len(results), 1)))
@@ -143,32 +141,34 @@ def initial_views(config: Config, band: Array) -> View:
     return View(azimuth, band[0] + (band[1] - band[0]) * (2.0 * (number % 3) + 1.0) / 6.0)
 
 
-def search_trials(key: Array, env: ViewSearchEnv, search: Any, initial: Sight, target: Sight) -> SearchResult:
-    """Runs a search from each of the sights `initial` and returns the results, both with leading axis N.
+def search_trials(
+    key: Array, env: ViewSearchEnv, search: Any, starts: tuple[Sight, Array], target: Sight
+) -> SearchResult:
+    """Runs a search from each of `starts` and returns the results, both with leading axis N.
 
     Args:
       key: PRNG key.
       env: the task.
       search: the searcher's function and its config.
-      initial: Sight of f32[N, ...].
+      starts: Sight of f32[N, ...] of the initial views and their scores f32[N].
       target: Sight of the target.
     """
     function, config = search
     num_samples = config.num_samples if isinstance(config, RandomSearchConfig) else config.population
 
-    def trial(item: tuple[Array, Sight]) -> SearchResult:
-        trial_key, start = item
+    def trial(item: tuple[Array, tuple[Sight, Array]]) -> SearchResult:
+        trial_key, (start, score) = item
         args = SearchArgs(
             initial=start.view,
             band=env.reach.band,
             threshold=jnp.asarray(env.config.env.threshold),
             task=(start.qpos, target.code),
-            initial_score=cosine_similarity(start.code, target.code),
+            initial_score=score,
         )
         return function(trial_key, functools.partial(score_view, env), args, config)
 
-    keys = jax.random.split(key, initial.qpos.shape[0])
-    return map_batched(trial, (keys, initial), max(1, env.config.evaluation.batch_size // num_samples))
+    keys = jax.random.split(key, starts[1].shape[0])
+    return map_batched(trial, (keys, starts), max(1, env.config.evaluation.batch_size // num_samples))
 
 
 def score_view(env: ViewSearchEnv, view: View, task: tuple[Array, Array]) -> Array:
@@ -219,8 +219,16 @@ def run_episode(key: Array, *, env: ViewSearchEnv, actor: Any, grid: Sight) -> d
     """Runs one episode of a policy and measures where it ended."""
     reset_key, search_key = jax.random.split(key)
     start = env.reset(reset_key)
-    result, end = sac.search(search_key, start, env.step, actor, env.config.sac, env.config.env)
-    first, last = episode_of(start), episode_of(end)
+    first = episode_of(start)
+    args = SearchArgs(
+        initial=first.sight.view,
+        band=env.reach.band,
+        threshold=jnp.asarray(env.config.env.threshold),
+        task=sac.PolicyTask(actor, start),
+        initial_score=start.metrics["similarity"],
+    )
+    result = sac.search(search_key, env.step, args, env.config)
+    last = episode_of(result.end)
     return outcome(env.config, result, last.sight.camera, last.target.camera) | {
         "initial_view": first.sight.view,
         "target_view": first.target.view,

@@ -127,6 +127,7 @@ def _interface(exported: dict[str, jax.export.Exported], config: Config) -> dict
     }
     return {
         "functions": functions,
+        "policy": "the mean of the trained policy; it keeps no memory of the episode",
         "meaning": {
             "picture": {
                 "rgb": "uint8, row 0 is the top, the object in the middle",

@@ -12,20 +12,35 @@ from typing import Any
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from vsearch_jax.run_folder import EVENTS, METRICS, write_text
+from vsearch_jax.run_folder import EVENTS, METRICS, RunError, write_text
 
 STAGES = ("encoder", "policy")
 """Names of the values of the metric `stage`."""
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Returns the complete lines of `metrics.jsonl`, one dict an iteration; empty where there are none."""
+    """Returns the complete lines of `metrics.jsonl`, one dict an iteration; empty where there are none.
+
+    Raises:
+      RunError: a complete line is damaged.
+    """
     path = run / METRICS
     if not path.is_file():
         return []
     text = path.read_text(encoding="utf-8")
     whole = text[: text.rfind("\n") + 1]  # a killed write leaves a last line without its end
-    return [json.loads(line) for line in whole.splitlines()]
+    return [_parse(path, number, line) for number, line in enumerate(whole.splitlines(), 1)]
+
+
+def _parse(path: Path, number: int, text: str) -> dict[str, Any]:
+    try:
+        line = json.loads(text)
+        is_whole = line["stage"] in STAGES and isinstance(line["iteration"], int) and line["seconds"] >= 0.0
+    except (ValueError, TypeError, KeyError):
+        is_whole = False
+    if not is_whole:
+        raise RunError(f"{path}: line {number} is damaged; restore the file, or delete that line")
+    return line
 
 
 class MetricsLog:

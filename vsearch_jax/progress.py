@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -14,8 +14,35 @@ from vsearch_jax.config import Config
 _LOSSES = {"encoder": "encoder_loss", "policy": "critic_loss"}
 
 
+class TrainingProgress:
+    """What the loop of chunks reports to.
+
+    Attributes:
+      bar: the bar on the terminal.
+      console: where the lines of the chunks go where there is no terminal.
+      config: the run's config.
+    """
+
+    def __init__(self, bar: Progress, console: Console, config: Config, step: int) -> None:
+        """Starts the bar at iteration `step`."""
+        self.bar, self.console, self.config = bar, console, config
+        self._task = bar.add_task("compiling", total=config.num_iterations, completed=step)
+
+    def update(self, step: int, seconds: float, lines: Sequence[Mapping[str, Any]]) -> None:
+        """Shows a chunk: `step` iterations done, its wall time in s, its lines of metrics.jsonl."""
+        text = describe(seconds, lines)
+        self.bar.update(self._task, completed=step, description=text)
+        if not self.console.is_terminal:
+            self.console.print(f"{step}/{self.config.num_iterations} {text}", highlight=False)
+
+    def stopping(self) -> None:
+        """Says that the running chunk is the last."""
+        self.bar.update(self._task, description="stopping after this chunk")
+        self.console.print("stopping after this chunk; interrupt again to leave it unsaved", highlight=False)
+
+
 @contextlib.contextmanager
-def training_progress(console: Console, config: Config, step: int) -> Iterator[Callable[..., None]]:
+def training_progress(console: Console, config: Config, step: int) -> Iterator[TrainingProgress]:
     """Shows the progress of training inside its block.
 
     Args:
@@ -24,7 +51,7 @@ def training_progress(console: Console, config: Config, step: int) -> Iterator[C
       step: iterations done before.
 
     Yields:
-      A function to call after each chunk with the iterations done, the chunk's wall time in s and its metrics' lines.
+      What to report to.
     """
     bar = Progress(
         SpinnerColumn(),
@@ -37,16 +64,8 @@ def training_progress(console: Console, config: Config, step: int) -> Iterator[C
         console=console,
         disable=not console.is_terminal,
     )
-    task = bar.add_task("compiling", total=config.num_iterations, completed=step)
-
-    def update(new_step: int, seconds: float, lines: Sequence[Mapping[str, Any]]) -> None:
-        text = describe(seconds, lines)
-        bar.update(task, completed=new_step, description=text)
-        if not console.is_terminal:
-            console.print(f"{new_step}/{config.num_iterations} {text}", highlight=False)
-
     with bar:
-        yield update
+        yield TrainingProgress(bar, console, config, step)
 
 
 def describe(seconds: float, lines: Sequence[Mapping[str, Any]]) -> str:

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from vsearch_jax.config import Config, ConfigError
 
+try:
+    import fcntl
+except ImportError:  # not on Windows, where two processes on one folder go unnoticed
+    fcntl = None
+
 CONFIG = "config.json"
+CHECKPOINTS = "checkpoints"
 METRICS = "metrics.jsonl"
 EVENTS = "tensorboard"
 
@@ -19,22 +27,21 @@ class RunError(ValueError):
     """A run's folder is in the way, missing or incomplete; the message says which and what to do."""
 
 
-def claim(run: Path) -> None:
-    """Makes the folder `run` for a new run; an empty one that exists will do.
+def claim(folder: Path) -> None:
+    """Makes the folder `folder` for new files; an empty one that exists will do.
 
     Raises:
       RunError: the folder holds something, or a file stands in its place.
     """
-    if run.is_dir() and not any(run.iterdir()):
-        return
-    if run.exists():
-        raise RunError(f"{run} exists; name another folder with --out, or go on with the run in it by --resume")
-    run.mkdir(parents=True)
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        hint = ", or go on with the run in it by --resume" if (folder / CONFIG).is_file() else ""
+        raise RunError(f"{folder} exists; name another folder with --out{hint}")
+    folder.mkdir(parents=True, exist_ok=True)
 
 
 @contextlib.contextmanager
 def claimed(run: Path) -> Iterator[None]:
-    """Makes the folder `run` for a new run, and empties it again if the block that is to start the run fails.
+    """Makes the folder `run` for a new run, and takes away what the block that is to start the run wrote if it fails.
 
     Raises:
       RunError: see `claim`.
@@ -43,14 +50,39 @@ def claimed(run: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        for path in run.iterdir():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        (run / CONFIG).unlink(missing_ok=True)
+        shutil.rmtree(run / CHECKPOINTS, ignore_errors=True)
         raise
 
 
-def write_config(run: Path, config: Config) -> None:
-    """Writes `config.json`; the other half is `read_config`."""
-    write_text(run / CONFIG, json.dumps(config.to_dict(), indent=2) + "\n")
+@contextlib.contextmanager
+def held(run: Path) -> Iterator[None]:
+    """Keeps other processes out of the folder `run`, if there is one, for as long as the block or this process lives.
+
+    Raises:
+      RunError: another process is at work in the folder.
+    """
+    if fcntl is None or not run.is_dir():
+        yield
+        return
+    descriptor = os.open(run, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunError(
+                f"another process is at work in {run}; wait for it or stop it, or name another folder"
+            ) from error
+        except OSError:
+            pass  # a file system without locks
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def write_config(run: Path, config: Config, seed: int) -> None:
+    """Writes `config.json`, the run's seed in it; the other half are `read_config` and `read_seed`."""
+    write_text(run / CONFIG, json.dumps({"seed": seed, **config.to_dict()}, indent=2) + "\n")
 
 
 def read_config(run: Path) -> Config:
@@ -60,26 +92,45 @@ def read_config(run: Path) -> Config:
       RunError: there is no such folder, or no run in it.
       ConfigError: config.json is damaged or holds a value out of its range.
     """
+    values = {name: value for name, value in _read(run).items() if name != "seed"}
+    try:
+        return Config.from_dict(values)
+    except (ValueError, TypeError, AttributeError) as error:  # out of its range, or of another type
+        raise ConfigError(f"{run / CONFIG}: {error}; {_REPAIR}") from error
+
+
+def read_seed(run: Path) -> int:
+    """Returns the seed of the run in the folder `run`; raises as `read_config`."""
+    seed = _read(run).get("seed")
+    if not isinstance(seed, int):
+        raise ConfigError(f"{run / CONFIG}: seed is {seed!r}, not a whole number; {_REPAIR}")
+    return seed
+
+
+_REPAIR = "restore it, or train into another folder"
+
+
+def _read(run: Path) -> dict[str, Any]:
     path = run / CONFIG
     if not path.is_file():
         raise RunError(f"no run in {run}: {CONFIG} is missing; name a folder that `vsearch train --out` made")
     try:
-        values = json.loads(path.read_text())
+        values = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ConfigError(f"{path} is not JSON ({error}); restore it, or train into another folder") from error
+        raise ConfigError(f"{path} is not JSON ({error}); {_REPAIR}") from error
     if not isinstance(values, dict):
-        raise ConfigError(f"{path} holds no JSON object; restore it, or train into another folder")
-    try:
-        return Config.from_dict(values)
-    except (ValueError, TypeError, AttributeError) as error:  # out of its range, or of another type
-        raise ConfigError(f"{path}: {error}; restore it, or train into another folder") from error
+        raise ConfigError(f"{path} holds no JSON object; {_REPAIR}")
+    return values
 
 
 def write_text(path: Path, text: str) -> None:
     """Replaces the file `path` by `text` in one step: whoever reads it sees the old text or the new one."""
     temporary = path.with_name(f".{path.name}.tmp")
     try:
-        temporary.write_text(text, encoding="utf-8")
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())  # else a crash of the machine may leave the new name with no content
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

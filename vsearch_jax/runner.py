@@ -43,7 +43,7 @@ def start(run: Path, config: Config, seed: int) -> TrainState:
     with run_folder.claimed(run):
         state = in_thread(init, jax.random.key(seed), config)
         check_target(state.reach, config)  # now, not when the training is done
-        run_folder.write_config(run, config)
+        run_folder.write_config(run, config, seed)
         checkpoint.save(run, state, config)
     return state
 
@@ -59,51 +59,73 @@ def resume(run: Path, config: Config) -> TrainState:
     template = jax.eval_shape(lambda key: init(key, config), jax.random.key(0))
     state = checkpoint.restore(run, template, config)
     if saved != config:  # in what only evaluation reads
-        run_folder.write_config(run, config)
+        run_folder.write_config(run, config, run_folder.read_seed(run))
     return state
 
 
 OnChunk = Callable[[int, float, Sequence[Mapping[str, Any]]], None]
 """Takes iterations done, the chunk's wall time in s and its lines of metrics.jsonl."""
 
+OnInterrupt = Callable[[], None]
+"""Called when the running chunk is to be the last."""
 
-def finish_training(run: Path, state: TrainState, config: Config, on_chunk: OnChunk) -> TrainState:
+
+def finish_training(
+    run: Path, state: TrainState, config: Config, on_chunk: OnChunk, on_interrupt: OnInterrupt = lambda: None
+) -> TrainState:
     """Trains from `state` to the end of the run, saving after each chunk.
+
+    An interrupt lets the running chunk end and saves it; a second one leaves it at once.
 
     Args:
       run: the run's folder.
       state: from `start` or `resume`; donated.
       config: the run's config.
       on_chunk: called after each chunk is saved.
+      on_interrupt: called at the first interrupt.
 
     Raises:
+      KeyboardInterrupt: the run was interrupted; the last checkpoint holds what was saved.
+      RunError: the training diverged, or metrics.jsonl is damaged.
       OSError: the disk is full or not writable; the last checkpoint stays.
     """
     step = int(state.step)
     log = MetricsLog(run, step)
     while step < config.num_iterations:
         began = time.perf_counter()
-        state, metrics = in_thread(train, state, config)
+        chunk, is_interrupted = in_background(train, state, config), False
+        try:
+            state, metrics = chunk.result()
+        except KeyboardInterrupt:
+            is_interrupted = True
+            on_interrupt()
+            state, metrics = chunk.result()
         seconds = time.perf_counter() - began
         new_step = int(state.step)
         # The last chunk may be shorter than its arrays.
         columns = {name: np.asarray(column)[: new_step - step] for name, column in metrics.items()}
-        check_finite(run, columns, step)
+        check_finite(run, columns, step, config)
         log.append(columns, step, seconds)
         checkpoint.save(run, state, config)
         on_chunk(new_step, seconds, log.lines[step - new_step :])
         step = new_step
+        if is_interrupted and step < config.num_iterations:
+            raise KeyboardInterrupt
     log.close()
     return state
 
 
-def check_finite(run: Path, columns: Mapping[str, np.ndarray], step: int) -> None:
+def check_finite(run: Path, columns: Mapping[str, np.ndarray], step: int, config: Config) -> None:
     """Raises RunError where the training diverged in a chunk that began at iteration `step`; nothing of it is saved."""
-    for stage, name in enumerate(("encoder_loss", "reward")):
-        if not np.isfinite(columns[name][columns["stage"] == stage]).all():
+    number = step + np.arange(len(columns["stage"])) - config.encoder.num_updates
+    is_encoder, is_policy = number < 0, number >= 0
+    is_updated = number * config.sac.num_envs >= config.sac.num_warmup_steps
+    checks = {"encoder_loss": is_encoder, "reward": is_policy, "critic_loss": is_updated, "actor_loss": is_updated}
+    for name, is_there in checks.items():
+        if not np.isfinite(columns[name][is_there]).all():
             raise RunError(
-                f"{run}: {name} is not finite after iteration {step}; the last checkpoint is good: "
-                f"start anew with a smaller {('encoder', 'sac')[stage]}.learning-rate"
+                f"{run}: {name} is not finite after iteration {step}: the training diverged, and that is not saved; "
+                f"start anew with a smaller {'encoder' if name == 'encoder_loss' else 'sac'}.learning-rate"
             )
 
 
@@ -128,6 +150,7 @@ def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str,
     }
     wall_seconds["evaluation"] = time.perf_counter() - began
     results = report.results(arrays, config, wall_seconds)
+    results["seed"] = run_folder.read_seed(run)
     search = jax.tree.map(np.asarray, in_thread(record_search, state, config))
     pictures = report.draw(results, arrays, search, state.reach, lines, config)
     report.write(run, results, pictures, config)
@@ -150,10 +173,15 @@ def release_memory() -> None:
 
 
 def in_thread(function: Callable[..., T], *arguments: Any) -> T:
-    """Returns `function(*arguments)` with its arrays computed; unlike a plain call it can be interrupted at once.
+    """Returns `function(*arguments)` with its arrays computed; unlike a plain call it can be interrupted at once."""
+    return in_background(function, *arguments).result()
+
+
+def in_background(function: Callable[..., T], *arguments: Any) -> concurrent.futures.Future[T]:
+    """Starts `function(*arguments)` in a thread of its own and returns the future of its arrays, computed.
 
     A signal's handler runs in the main thread only, and there only between two steps of Python, while one call of a
-    compiled function may take hours. So the call is made in another thread, which an interrupt leaves behind.
+    compiled function may take hours. So the main thread only waits, and an interrupt may leave the call behind.
     """
     future: concurrent.futures.Future[T] = concurrent.futures.Future()
 
@@ -164,4 +192,4 @@ def in_thread(function: Callable[..., T], *arguments: Any) -> T:
             future.set_exception(error)
 
     threading.Thread(target=call, daemon=True).start()
-    return future.result()
+    return future

@@ -16,7 +16,7 @@ from jax import Array
 from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.config import Config
-from vsearch_jax.env import ViewSearchEnv
+from vsearch_jax.env import ViewSearchEnv, check_band
 from vsearch_jax.search import sac
 from vsearch_jax.types import Sight, TrainState, Transition
 
@@ -81,7 +81,11 @@ def train(state: TrainState, config: Config) -> tuple[TrainState, dict[str, Arra
       The new state, and metrics by name, f32[n] with one entry for each of the chunk's iterations, n =
       `config.chunk_length`; `stage` i32[n] tells encoder (0) and policy (1) iterations, -1 stands past the end of the
       run. A metric is NaN where its stage was not run, the policy's are means over seeds.
+
+    Raises:
+      ConfigError: the arm reaches no elevation at every azimuth.
     """
+    check_band(state.reach, config)
     return _train(state, config=config)
 
 

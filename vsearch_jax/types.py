@@ -217,6 +217,7 @@ class SearchResult:
       best_scores: f32[G], best score so far after each generation; the last value repeats after the end.
       evaluations: i32[], images taken until the threshold was met, all of them if it was not.
       unreachable: i32[], how many of these the arm could not reach.
+      end: what the searcher ended in beyond this: of a policy the brax State, else None.
     """
 
     view: View
@@ -224,3 +225,4 @@ class SearchResult:
     best_scores: Array
     evaluations: Array
     unreachable: Array
+    end: Any = None

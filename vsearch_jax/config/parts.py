@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vsearch_jax.config.validation import require, require_positive, require_unit
+from vsearch_jax.config.validation import require, require_finite, require_positive, require_unit
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         require_positive(self, "mount_height", "radius", "image_size")
+        require_finite(self, "center_height", "table_clearance")
         require(self, "center_height", self.center_height >= 0.0, "0 or more")
         require(self, "table_clearance", self.table_clearance >= 0.0, "0 or more")
         require(self, "image_size", self.image_size % 16 == 0, "a multiple of 16")
@@ -143,6 +144,7 @@ class EnvConfig:
         require(self, "threshold", -1.0 < self.threshold < 1.0, "between -1 and 1")
         require(self, "action_scale_deg", 0.0 < self.action_scale_deg <= 180.0, "above 0, at most 180")
         require_positive(self, "episode_length")
+        require_finite(self, "success_reward", "unreachable_reward")
 
 
 @dataclass(frozen=True)
@@ -221,6 +223,7 @@ class SACConfig:
         )
         require(self, "hidden_sizes", len(self.hidden_sizes) > 0 and min(self.hidden_sizes) > 0, "positive counts")
         require_unit(self, "discount", "relabel_fraction", "tau")
+        require_finite(self, "target_entropy")
         require(
             self,
             "num_environment_steps",
@@ -251,11 +254,14 @@ class EvaluationConfig:
     """Runs from each initial view."""
     num_episodes: int = 1000
     """Episodes of each policy, initial view and target both random."""
+    patience: int = 8
+    """Steps for which a policy acts by itself; an episode that has not ended by then goes on as random search."""
     batch_size: int = 125
     """Episodes that run side by side."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "num_runs", "num_episodes", "batch_size")
+        require_positive(self, "num_runs", "num_episodes", "patience", "batch_size")
+        require_finite(self, "target_azimuth_deg")
         require(
             self, "num_initial_views", self.num_initial_views > 0 and self.num_initial_views % 4 == 0, "a multiple of 4"
         )

@@ -22,6 +22,12 @@ def require_positive(owner: object, *names: str) -> None:
         require(owner, name, 0 < getattr(owner, name) < math.inf, "greater than 0, finite")
 
 
+def require_finite(owner: object, *names: str) -> None:
+    """Raises ConfigError where one of the fields `names` of `owner` is not a finite number."""
+    for name in names:
+        require(owner, name, math.isfinite(getattr(owner, name)), "finite")
+
+
 def require_unit(owner: object, *names: str) -> None:
     """Raises ConfigError where one of the fields `names` of `owner` is not from 0 to 1."""
     for name in names:

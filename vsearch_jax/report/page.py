@@ -75,13 +75,14 @@ def write(folder: Path, results: Mapping[str, Any], pictures: Mapping[str, Figur
     Raises:
       OSError: the disk is full or not writable.
     """
+    text = json.dumps(results, indent=2, allow_nan=False) + "\n"  # before anything is written over
     (folder / "figures").mkdir(exist_ok=True)
     images = {name: _png(picture) for name, picture in pictures.items()}
     for name, image in images.items():
         (folder / "figures" / f"{name}.png").write_bytes(image)
     (folder / "report.html").write_text(_page(folder.absolute().name, results, images, config), encoding="utf-8")
     # The last one: where it is, the report is whole.
-    (folder / "results.json").write_text(json.dumps(results, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    (folder / "results.json").write_text(text, encoding="utf-8")
 
 
 @styled

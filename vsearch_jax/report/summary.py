@@ -32,11 +32,14 @@ def results(arrays: Mapping[str, Any], config: Config, wall_seconds: Mapping[str
       config: the run's config.
       wall_seconds: wall time of each stage of the run.
     """
-    searchers = {name: summarize(jax.tree.map(np.asarray, arrays[name])) for name in ("random_search", "cma_es")}
+    patience = config.evaluation.patience
+    searchers = {
+        name: summarize(jax.tree.map(np.asarray, arrays[name]), patience) for name in ("random_search", "cma_es")
+    }
     policies = jax.tree.map(np.asarray, arrays["sac"])
-    pooled = summarize(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), policies))
+    pooled = summarize(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), policies), patience)
     seeds = [
-        {"seed": seed, **summarize(jax.tree.map(lambda x, s=seed: x[s], policies))}
+        {"seed": seed, **summarize(jax.tree.map(lambda x, s=seed: x[s], policies), patience)}
         for seed in range(policies["is_success"].shape[0])
     ]
     pooled |= {"environment_steps": config.sac.num_environment_steps, "seeds": seeds}
@@ -55,11 +58,12 @@ def results(arrays: Mapping[str, Any], config: Config, wall_seconds: Mapping[str
     }
 
 
-def summarize(trials: Mapping[str, Any]) -> dict[str, Any]:
+def summarize(trials: Mapping[str, Any], patience: int) -> dict[str, Any]:
     """Returns the measures of SPEC.md 4 over trials.
 
     Args:
       trials: arrays [N] of `evaluate` for one searcher.
+      patience: steps after which an episode of a policy goes on as random search.
     """
     rotation = np.rad2deg(trials["rotation_error"])
     evaluations = trials["evaluations"]
@@ -80,6 +84,7 @@ def summarize(trials: Mapping[str, Any]) -> dict[str, Any]:
         bound = trials["steps_lower_bound"]
         summary |= _mean("steps_lower_bound_mean", bound)
         summary["evaluations_over_lower_bound"] = float(evaluations.mean() / bound.mean())
+        summary |= _rate("fallback_rate", (evaluations > patience).sum(), evaluations.size)
     return summary
 
 
