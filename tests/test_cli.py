@@ -208,6 +208,12 @@ def wait_for_step(out: Path, step: int, process: subprocess.Popen[str]) -> None:
         time.sleep(0.01)
 
 
+def wait_for_line(start: str, process: subprocess.Popen[str]) -> None:
+    assert process.stdout is not None
+    while not (line := process.stdout.readline()).startswith(start):
+        assert line, process.communicate()
+
+
 def test_killed_and_resumed_equals_uninterrupted(quick: None, tmp_path: Path) -> None:
     arguments = ["train", "--preset", "smoke", "--seed", "3", "--out"]
     cli.main([*arguments, str(tmp_path / "whole")])
@@ -228,12 +234,35 @@ def test_killed_and_resumed_equals_uninterrupted(quick: None, tmp_path: Path) ->
     assert (out / "results.json").exists()
 
 
+@pytest.mark.slow
+def test_the_real_run_killed_and_resumed_equals_uninterrupted(tmp_path: Path) -> None:
+    start = "from vsearch_jax.cli import main; main()"
+    arguments = ["-c", start, "train", "--preset", "smoke", "--seed", "3", "--sac.num-seeds", "2", "--out"]
+    subprocess.run(**program(*arguments, str(tmp_path / "whole")), check=True, stdout=subprocess.DEVNULL)
+    out = tmp_path / "killed"
+    for step in (6, 12):
+        last = ["--resume"] if step > 6 else []
+        process = subprocess.Popen(**program(*arguments, str(out), *last), stdout=subprocess.DEVNULL)
+        wait_for_step(out, step, process)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    subprocess.run(**program(*arguments, str(out), "--resume"), check=True, stdout=subprocess.DEVNULL)
+    assert without_times(out) == without_times(tmp_path / "whole")
+    whole, killed = stored_state(tmp_path / "whole"), stored_state(out)
+    assert whole.keys() == killed.keys()
+    for name in whole:
+        np.testing.assert_array_equal(whole[name], killed[name], err_msg=name)
+    results = [json.loads((tmp_path / run / "results.json").read_text()) for run in ("whole", "killed")]
+    assert all(results[0][name] == results[1][name] for name in ("random_search", "cma_es", "sac", "seed"))
+
+
 @pytest.mark.parametrize("signal_", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_says_how_to_go_on(quick: None, tmp_path: Path, signal_: signal.Signals) -> None:
     out = tmp_path / "run"
     command = ["train", "--preset", "smoke", "--out", str(out)]
-    process = subprocess.Popen(**program(STANDIN, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    wait_for_step(out, 6, process)
+    process = subprocess.Popen(**program(STANDIN, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=1)
+    wait_for_line("6/24", process)
+    time.sleep(0.2)  # into the second chunk
     process.send_signal(signal_)
     output, errors = process.communicate(timeout=120)
     assert process.returncode == 130
@@ -251,11 +280,10 @@ def test_a_second_interrupt_leaves_the_chunk(tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = program(STANDIN, "train", "--preset", "smoke", "--out", str(out))
     process = subprocess.Popen(**command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=1)
-    assert process.stdout is not None
-    assert "6/24" in process.stdout.readline()
-    process.send_signal(signal.SIGINT)
-    assert "stopping after this chunk" in process.stdout.readline()
-    process.send_signal(signal.SIGINT)
+    for line in ("6/24", "stopping after this chunk"):
+        wait_for_line(line, process)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "6 iterations are saved" in errors and checkpoint.latest_step(out) == 6

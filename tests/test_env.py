@@ -10,6 +10,7 @@ import pytest
 from brax.envs.wrappers.training import wrap
 
 import vsearch_jax as vs
+from vsearch_jax.config import ConfigError
 from vsearch_jax.env import pose_error
 from vsearch_jax.geometry import cosine_similarity, view_pose
 from vsearch_jax.types import View
@@ -45,6 +46,16 @@ def test_sizes_are_those_of_the_contract(env, reset):
     assert state.obs.shape == (265,)
     sight, target = state.pipeline_state.sight, state.pipeline_state.target
     np.testing.assert_array_equal(state.obs, np.concatenate([sight.code, target.code, sight.qpos]))
+
+
+def test_an_arm_without_a_band_is_refused(env):
+    nowhere = env.reach.replace(band=jnp.full(2, jnp.nan))
+    with pytest.raises(ConfigError, match=r"'lwr' .*mount_height 1.355 reaches no elevation at every azimuth"):
+        vs.ViewSearchEnv(CONFIG, env.encoder, nowhere)
+    state = vs.init(jax.random.key(0), CONFIG)
+    for run in (vs.train, vs.evaluate):
+        with pytest.raises(ConfigError, match="reaches no elevation"):
+            run(state.replace(reach=nowhere), CONFIG)
 
 
 def test_initial_view_and_target_are_random_over_the_band(env, reset):

@@ -10,9 +10,10 @@ import concurrent.futures
 import contextlib
 import ctypes
 import gc
+import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -89,17 +90,18 @@ def finish_training(
       RunError: the training diverged, or metrics.jsonl is damaged.
       OSError: the disk is full or not writable; the last checkpoint stays.
     """
+    with stop_requested(on_interrupt) as is_stopping:
+        return _train_chunks(run, state, config, on_chunk, is_stopping)
+
+
+def _train_chunks(
+    run: Path, state: TrainState, config: Config, on_chunk: OnChunk, is_stopping: threading.Event
+) -> TrainState:
     step = int(state.step)
     log = MetricsLog(run, step)
     while step < config.num_iterations:
         began = time.perf_counter()
-        chunk, is_interrupted = in_background(train, state, config), False
-        try:
-            state, metrics = chunk.result()
-        except KeyboardInterrupt:
-            is_interrupted = True
-            on_interrupt()
-            state, metrics = chunk.result()
+        state, metrics = in_thread(train, state, config)
         seconds = time.perf_counter() - began
         new_step = int(state.step)
         # The last chunk may be shorter than its arrays.
@@ -109,10 +111,35 @@ def finish_training(
         checkpoint.save(run, state, config)
         on_chunk(new_step, seconds, log.lines[step - new_step :])
         step = new_step
-        if is_interrupted and step < config.num_iterations:
+        if is_stopping.is_set() and step < config.num_iterations:
             raise KeyboardInterrupt
     log.close()
     return state
+
+
+@contextlib.contextmanager
+def stop_requested(on_interrupt: OnInterrupt) -> Iterator[threading.Event]:
+    """Yields an event that the block's first SIGINT or SIGTERM sets; a second one raises KeyboardInterrupt.
+
+    Outside of the main thread, where Python delivers no signals, it is never set.
+    """
+    event = threading.Event()
+
+    def handle(number: int, frame: object) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+        on_interrupt()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def check_finite(run: Path, columns: Mapping[str, np.ndarray], step: int, config: Config) -> None:
@@ -173,15 +200,10 @@ def release_memory() -> None:
 
 
 def in_thread(function: Callable[..., T], *arguments: Any) -> T:
-    """Returns `function(*arguments)` with its arrays computed; unlike a plain call it can be interrupted at once."""
-    return in_background(function, *arguments).result()
-
-
-def in_background(function: Callable[..., T], *arguments: Any) -> concurrent.futures.Future[T]:
-    """Starts `function(*arguments)` in a thread of its own and returns the future of its arrays, computed.
+    """Returns `function(*arguments)` with its arrays computed; unlike a plain call it can be interrupted at once.
 
     A signal's handler runs in the main thread only, and there only between two steps of Python, while one call of a
-    compiled function may take hours. So the main thread only waits, and an interrupt may leave the call behind.
+    compiled function may take hours. So the call is made in another thread, which an interrupt leaves behind.
     """
     future: concurrent.futures.Future[T] = concurrent.futures.Future()
 
@@ -192,4 +214,4 @@ def in_background(function: Callable[..., T], *arguments: Any) -> concurrent.fut
             future.set_exception(error)
 
     threading.Thread(target=call, daemon=True).start()
-    return future
+    return future.result()

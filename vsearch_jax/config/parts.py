@@ -254,13 +254,14 @@ class EvaluationConfig:
     """Runs from each initial view."""
     num_episodes: int = 1000
     """Episodes of each policy, initial view and target both random."""
-    patience: int = 8
-    """Steps for which a policy acts by itself; an episode that has not ended by then goes on as random search."""
+    patience: int = 7
+    """Steps for which a policy acts by itself; after them, steps of random search help it where it goes in circles."""
     batch_size: int = 125
     """Episodes that run side by side."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "num_runs", "num_episodes", "patience", "batch_size")
+        require_positive(self, "num_runs", "num_episodes", "batch_size")
+        require(self, "patience", self.patience >= 2, "2 or more")
         require_finite(self, "target_azimuth_deg")
         require(
             self, "num_initial_views", self.num_initial_views > 0 and self.num_initial_views % 4 == 0, "a multiple of 4"

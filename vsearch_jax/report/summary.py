@@ -63,7 +63,7 @@ def summarize(trials: Mapping[str, Any], patience: int) -> dict[str, Any]:
 
     Args:
       trials: arrays [N] of `evaluate` for one searcher.
-      patience: steps after which an episode of a policy goes on as random search.
+      patience: steps after which random search may help a policy.
     """
     rotation = np.rad2deg(trials["rotation_error"])
     evaluations = trials["evaluations"]
