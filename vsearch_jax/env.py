@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
 from jax import Array
+from jax.core import Tracer
 
 from vsearch_jax import encoder as encoders
 from vsearch_jax import render
@@ -205,7 +206,7 @@ def check_band(reach: ReachabilityMap, config: Config) -> None:
     Raises:
       ConfigError: the arm reaches no elevation at every azimuth.
     """
-    if not isinstance(reach.band, jax.core.Tracer) and np.isnan(reach.band).any():
+    if not isinstance(reach.band, Tracer) and np.isnan(reach.band).any():
         raise ConfigError(
             f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
             f"at every azimuth around object {config.scene.object!r}; try another mount_height or radius"

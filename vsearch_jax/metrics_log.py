@@ -33,13 +33,14 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 
 def _parse(path: Path, number: int, text: str) -> dict[str, Any]:
+    error = RunError(f"{path}: line {number} is damaged; restore the file, or delete that line")
     try:
         line = json.loads(text)
         is_whole = line["stage"] in STAGES and isinstance(line["iteration"], int) and line["seconds"] >= 0.0
     except (ValueError, TypeError, KeyError):
-        is_whole = False
+        raise error from None
     if not is_whole:
-        raise RunError(f"{path}: line {number} is damaged; restore the file, or delete that line")
+        raise error
     return line
 
 
