@@ -255,7 +255,7 @@ class EvaluationConfig:
     num_episodes: int = 1000
     """Episodes of each policy, initial view and target both random."""
     patience: int = 7
-    """Steps for which a policy acts by itself; after them, steps of random search help it where it goes in circles."""
+    """Steps after which a policy that comes no nearer is helped by steps of random search."""
     batch_size: int = 125
     """Episodes that run side by side."""
 

@@ -31,7 +31,9 @@ from vsearch_jax.types import EpisodeState, SearchResult, View
 _IMPROVEMENT = 3e-3
 """A step that raises the best cosine by less comes no nearer."""
 _NEAR = 0.9
-"""From this cosine on, some ten degrees off, random search alone is the quicker way."""
+"""From this cosine on, the target is some ten degrees off."""
+_SAMPLES, _SWEEPS, _TRIES = 3, 2, 4
+"""Steps in a turn of help: of random search, of a sweep, of the policy."""
 
 StepFn = Callable[[State, Array], State]
 """The environment's `step`, (state, action) -> state; to this searcher what `ScoreFn` is to the others."""
@@ -51,15 +53,30 @@ class PolicyTask:
     start: State
 
 
+@flax.struct.dataclass
+class _Carry:
+    """State of the loop.
+
+    Attributes:
+      record: Record.
+      state: brax State.
+      lost_at: i32[], the step from which on the policy is helped; the episode's length while it is not.
+    """
+
+    record: Record
+    state: State
+    lost_at: Array
+
+
 def search(key: Array, step_fn: StepFn, args: SearchArgs, config: Config) -> SearchResult:
     """Follows the policy until the threshold is met or the episode is out of steps.
 
-    The policy acts by its mean. Half a turn takes six steps of 30 degrees; a policy that has not arrived after
-    `config.evaluation.patience` steps, and no longer comes nearer, goes round in a circle, mostly a little beside the
-    target. The next step is then one of random search (SPEC.md 5): to a random view around the best one of the way, or
-    as far towards it as a step leads. Where the best view is far from the target, it is a step of a sweep around the
-    object instead, from which the policy takes over when the cosine rises. The same step follows one that the arm could
-    not do, which the policy's mean would repeat for ever.
+    The policy acts by its mean. In some episodes in a thousand that goes round in a circle beside the target. So one
+    that no longer comes nearer, once it is near or after `config.evaluation.patience` steps, is helped in turns: three
+    steps of random search (SPEC.md 5), to views around the best one of the way; two steps of a sweep around the
+    object; four of the policy, which now comes from elsewhere. Where the best view is far from the target it sweeps
+    until the cosine rises. One step of help also follows one that the arm could not do, which a mean would repeat for
+    ever.
 
     A step is one generation of one image; as a policy is measured by its episode length, the image of the start does
     not count. An episode is at least one step long, as in training, where the start may meet the threshold already.
@@ -77,40 +94,53 @@ def search(key: Array, step_fn: StepFn, args: SearchArgs, config: Config) -> Sea
     start: State = args.task.start
     record = start_record(args.initial, jnp.asarray(-jnp.inf, jnp.float32), config.env.episode_length)
     record = dataclasses.replace(record, evaluations=jnp.int32(0), unreachable=jnp.int32(0))
+    carry = _Carry(record=record, state=start, lost_at=jnp.int32(config.env.episode_length))
     body = functools.partial(_step, key, step_fn, args, config)
-    record, end = jax.lax.while_loop(lambda carry: is_running(carry[0], args.threshold), body, (record, start))
-    return dataclasses.replace(to_result(record), view=_view(end), score=end.metrics["similarity"], end=end)
+    carry = jax.lax.while_loop(lambda carry: is_running(carry.record, args.threshold), body, carry)
+    result, end = to_result(carry.record), carry.state
+    return dataclasses.replace(result, view=_view(end), score=end.metrics["similarity"], end=end)
 
 
-def _step(
-    key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: tuple[Record, State]
-) -> tuple[Record, State]:
-    record, state = carry
+def _step(key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: _Carry) -> _Carry:
+    record, state = carry.record, carry.state
+    steps = record.generation
+    is_near = record.score >= _NEAR
+    has_improved = record.score - record.best_scores[steps - 2] > _IMPROVEMENT
+    is_lost = ~has_improved & ((steps >= config.evaluation.patience) | (is_near & (steps >= 2)))
+    lost_at = jnp.minimum(carry.lost_at, jnp.where(is_lost, steps, config.env.episode_length))
+    turn = (steps - lost_at) % (_SAMPLES + _SWEEPS + _TRIES)
+    is_helped = (steps >= lost_at) & (turn < _SAMPLES + _SWEEPS) & (is_near | ~has_improved)
+    is_helped |= state.info["is_reachable"] < 0.5
+    is_sampled = is_near & ((steps < lost_at) | (turn < _SAMPLES))
+
+    view = _random_view(key, record, state, args.band, config)
+    view = jax.tree.map(lambda near, swept: jnp.where(is_sampled, near, swept), *view)
     observation: Array = state.obs  # pyright: ignore[reportAssignmentType] # brax allows dictionaries too
-    is_lost = record.generation >= config.evaluation.patience
-    is_lost &= record.score - record.best_scores[record.generation - 2] <= _IMPROVEMENT
-    is_lost |= state.info["is_reachable"] < 0.5
-    random_action = _random_action(key, record, state, args.band, config)
-    state = step_fn(state, jnp.where(is_lost, random_action, act(None, args.task.actor, observation, config.sac)))
+    action = act(None, args.task.actor, observation, config.sac)
+    state = step_fn(state, jnp.where(is_helped, _action_to(view, state, config), action))
     score = jnp.where(state.info["is_reachable"] > 0.5, state.metrics["similarity"], -jnp.inf)
     views, scores = jax.tree.map(lambda x: x[None], (_view(state), score))
-    return add_generation(record, views, scores, args.threshold), state
+    return _Carry(record=add_generation(record, views, scores, args.threshold), state=state, lost_at=lost_at)
 
 
-def _random_action(key: Array, record: Record, state: State, band: Array, config: Config) -> Array:
-    """Returns f32[2], the action to, or towards, a random view: around the best one, or further round the object."""
-    sweep_key, sample_key, elevation_key = jax.random.split(key, 3)
-    near = sample_around_best(
-        jax.random.fold_in(sample_key, record.generation), record, band, config.random_search.k, 1
+def _random_view(key: Array, record: Record, state: State, band: Array, config: Config) -> tuple[View, View]:
+    """Returns a view around the best one, and one that lies a step further round the object."""
+    side_key, sample_key, elevation_key = jax.random.split(key, 3)
+    sample_key, elevation_key = (jax.random.fold_in(k, record.generation) for k in (sample_key, elevation_key))
+    near = sample_around_best(sample_key, record, band, config.random_search.k, 1)
+    side = jax.random.rademacher(side_key, (), jnp.float32)  # the same in all steps
+    swept = View(
+        azimuth=wrap_angle(_view(state).azimuth + side * math.radians(config.env.action_scale_deg)),
+        elevation=jax.random.uniform(elevation_key, (), jnp.float32, *band),
     )
-    here, scale = _view(state), math.radians(config.env.action_scale_deg)
-    way_round = scale * jax.random.rademacher(sweep_key, (), jnp.float32)  # the same in all steps
-    elevation = jax.random.uniform(jax.random.fold_in(elevation_key, record.generation), (), jnp.float32, *band)
-    is_near = record.score >= _NEAR
-    azimuth = jnp.where(is_near, near.azimuth[0], here.azimuth + way_round)
-    elevation = jnp.where(is_near, near.elevation[0], elevation)
-    change = jnp.stack([wrap_angle(azimuth - here.azimuth), elevation - here.elevation])
-    return jnp.clip(change / scale, -1.0, 1.0)
+    return View(near.azimuth[0], near.elevation[0]), swept
+
+
+def _action_to(view: View, state: State, config: Config) -> Array:
+    """Returns f32[2], the action to `view`, or towards it where it is further than a step."""
+    here = _view(state)
+    change = jnp.stack([wrap_angle(view.azimuth - here.azimuth), view.elevation - here.elevation])
+    return jnp.clip(change / math.radians(config.env.action_scale_deg), -1.0, 1.0)
 
 
 def _view(state: State) -> View:
