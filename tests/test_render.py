@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from mujoco import mjtGeom, mjtLightType
 
 from render_oracles import (
+    MOST_GEOMS,
     cast_image,
     forward,
     on_outline,
@@ -117,7 +118,25 @@ _render = jax.jit(render.render, static_argnames="size")
 @given(seed=SEEDS)
 @settings(max_examples=15)
 def test_image_equals_mj_multi_ray(seed: int) -> None:
-    model = random_scene(np.random.default_rng(seed))
+    _assert_equals_mj_multi_ray(random_scene(np.random.default_rng(seed)))
+
+
+@given(seed=SEEDS)
+@settings(max_examples=10)
+def test_image_with_meshes_equals_mj_multi_ray(seed: int) -> None:
+    _assert_equals_mj_multi_ray(random_scene(np.random.default_rng(seed), num_geoms=10, num_meshes=6))
+
+
+@pytest.mark.slow
+@given(seed=SEEDS, num_geoms=st.sampled_from((0, 5, 15, 25)), num_meshes=st.sampled_from((0, 1, 4, 12)))
+@settings(max_examples=250)
+def test_many_images_equal_mj_multi_ray(seed: int, num_geoms: int, num_meshes: int) -> None:
+    model = random_scene(np.random.default_rng(seed), num_geoms=num_geoms, num_meshes=num_meshes)
+    assert model.ngeom <= MOST_GEOMS
+    _assert_equals_mj_multi_ray(model)
+
+
+def _assert_equals_mj_multi_ray(model: mujoco.MjModel) -> None:
     data = forward(model)
     depth, ids = cast_image(model, data, 0, SIZE)
     frames = poses(model, data)

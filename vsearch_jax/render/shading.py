@@ -18,7 +18,8 @@ class Surface(NamedTuple):
 
     Attributes:
       point: three f32[H, W] m.
-      normal: three f32[H, W], unit, towards the camera's side.
+      normal: three f32[H, W], unit, towards the camera's side, of the smooth surface that a face stands for.
+      flat: three f32[H, W], the same of the face itself; `normal` elsewhere.
       rgb: three f32[H, W] in [0, 1].
       specular: f32[H, W].
       shininess: f32[H, W].
@@ -27,6 +28,7 @@ class Surface(NamedTuple):
 
     point: Vector
     normal: Vector
+    flat: Vector
     rgb: Vector
     specular: Array
     shininess: Array
