@@ -48,8 +48,30 @@ def camera_from_pose(T_world_camera: SE3, fovy: Array | float) -> Camera:
     )
 
 
+def camera_from_matrix(T_world_camera: SE3, matrix: Array) -> Camera:
+    """Returns the camera with a calibrated camera's matrix.
+
+    Args:
+      T_world_camera: pose of the camera, which looks along its own -z with +y up. OpenCV's looks along +z with +y down:
+        turn its pose by pi around its x axis.
+      matrix: f32[3, 3] pixels, ((fx, 0, cx), (0, fy, cy), (0, 0, 1)), for the size of the images that are drawn.
+    """
+    intrinsics = jnp.stack([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]).astype(jnp.float32)
+    return camera_from_pose(T_world_camera, 0.0).replace(intrinsics=intrinsics)
+
+
+def magnified(camera: Camera, factor: int) -> Camera:
+    """Returns the camera that sees the same in images `factor` times as large."""
+    if camera.intrinsics is None:
+        return camera
+    focal, center = camera.intrinsics[:2], camera.intrinsics[2:]
+    return camera.replace(intrinsics=jnp.concatenate([factor * focal, factor * (center + 0.5) - 0.5]))
+
+
 def pinhole(camera: Camera, size: tuple[int, int]) -> Pinhole:
-    """Returns how `camera` maps onto an image of height and width `size`; pixels are square."""
+    """Returns how `camera` maps onto an image of height and width `size`."""
+    if camera.intrinsics is not None:
+        return Pinhole(*camera.intrinsics)
     height, width = size
     scale = 0.5 * height / jnp.tan(0.5 * camera.fovy)
     center_x, center_y = (jnp.full_like(scale, 0.5 * (count - 1)) for count in (width, height))

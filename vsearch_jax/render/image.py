@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from vsearch_jax.render import shading, trace
+from vsearch_jax.render import shading, texturing, trace
 from vsearch_jax.render.boundary import materialize, unknown_zero
-from vsearch_jax.render.camera import pinhole, pixel_rays
+from vsearch_jax.render.camera import magnified, pinhole, pixel_rays
 from vsearch_jax.render.lighting import (
     LightPoses,
     incidences,
@@ -23,7 +23,7 @@ from vsearch_jax.render.lighting import (
 )
 from vsearch_jax.render.pixels import surface_of
 from vsearch_jax.render.raster import Pinhole, Raster, View, rasterize
-from vsearch_jax.render.scene import RenderScene
+from vsearch_jax.render.scene import RenderError, RenderScene
 from vsearch_jax.render.shadow_map import ShadowMap
 from vsearch_jax.render.tiling import Tiling
 from vsearch_jax.types import Camera, Image
@@ -41,6 +41,7 @@ class _Sight(NamedTuple):
     """What all parts of the image share."""
 
     frames: trace.Frames
+    rotation: Array
     lights: LightPoses
     shadows: dict[int, ShadowMap]
     zero: Array
@@ -82,7 +83,7 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
         hits = jax.lax.map(functools.partial(_hits, fixed_scene, fixed_frames), fixed_tiles)
         seen = (x * hits.depth, y * hits.depth, -hits.depth), hits.is_hit
         shadows = shadow_maps(fixed_scene, fixed_frames, fixed_lights, seen, zero)
-    sight = _Sight(frames, lights, shadows, zero)
+    sight = _Sight(frames, camera.rotation, lights, shadows, zero)
     parts = jax.lax.map(functools.partial(_render_tile, scene, sight), tiles)
     return jax.tree.map(tiling.join, parts)
 
@@ -100,20 +101,48 @@ def _hits(scene: RenderScene, frames: trace.Frames, tile: _Tile) -> trace.Hits:
 
 
 def _render_tile(scene: RenderScene, sight: _Sight, tile: _Tile) -> Image:
-    """Returns the image of one part of the pixels; its rgb is f32[3, h, w]."""
+    """Returns the image of one part of the pixels; its rgb and normal are f32[3, h, w]."""
     rays, zero = tile[0], sight.zero
     hits = _hits(*jax.lax.stop_gradient((scene, sight.frames, tile)))
     depth, surface = surface_of(scene, sight.frames, hits, rays, zero)
     hits = hits._replace(depth=depth)
     lit = lit_by(scene, sight.frames, hits, rays, (sight.lights, sight.shadows), surface)
     channels = shading.shade(scene, surface, materialize(incidences(scene, sight.lights, surface, rays, lit), zero))
-    rgb = [jnp.where(hits.is_hit, channel, scene.background[i]) for i, channel in enumerate(channels)]
+    behind = (scene.background[0], scene.background[1], scene.background[2])
+    if scene.textures is not None and scene.textures.sky is not None:
+        behind = texturing.sky(scene.textures, trace.apply(sight.rotation, (*rays, -jnp.ones_like(rays[0]))))
+    rgb = [jnp.where(hits.is_hit, channel, b) for channel, b in zip(channels, behind, strict=True)]
     geom_ids = jnp.asarray(scene.geom_ids, dtype=jnp.int32).at[hits.slot].get(mode="promise_in_bounds")
     return Image(
         rgb=jnp.stack(materialize(rgb, zero)),
         depth=jnp.where(hits.is_hit, depth, jnp.inf),
         geom_id=jnp.where(hits.is_hit, geom_ids, -1),
+        normal=jnp.stack([jnp.where(hits.is_hit, axis, 0.0) for axis in trace.apply(sight.rotation, surface.normal)]),
     )
+
+
+def supersample(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int], factor: int) -> Image:
+    """Returns what `render` does, with the colour of each pixel the mean of `factor` x `factor` rays.
+
+    Depth, geom_id and normal are those of the middle ray.
+
+    Args:
+      scene: RenderScene.
+      data: see `render`.
+      camera: Camera.
+      size: height and width in pixels, static.
+      factor: odd, static; the cost grows with its square.
+
+    Raises:
+      RenderError: `factor` is even or not positive.
+    """
+    if factor < 1 or factor % 2 == 0:
+        raise RenderError(f"factor is {factor}; it must be 1, 3, 5, ..., so that one ray goes through a pixel's centre")
+    fine = render(scene, data, magnified(camera, factor), (factor * size[0], factor * size[1]))
+    rgb = fine.rgb.reshape(size[0], factor, size[1], factor, 3).mean(axis=(1, 3))
+    middle = slice(factor // 2, None, factor)
+    depth, geom_id, normal = (plane[middle, middle] for plane in (fine.depth, fine.geom_id, fine.normal))
+    return Image(rgb, depth, geom_id, normal)
 
 
 def _frames(scene: RenderScene, data: Any, camera: Camera) -> trace.Frames:

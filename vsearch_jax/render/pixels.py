@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxlie import SO3
 
-from vsearch_jax.render import trace
+from vsearch_jax.render import texturing, trace
 from vsearch_jax.render.boundary import materialize
 from vsearch_jax.render.rays import Vector, dot
 from vsearch_jax.render.scene import RenderScene
@@ -54,7 +54,8 @@ def surface_of(
     starts, is_face = trace.type_starts(scene), hits.slot >= scene.num_primitives
     faces = None
     if scene.triangles is not None:
-        faces = materialize(look_up(scene.triangles.surface[:16], hits.face), zero)
+        count = 24 if any(scene.triangles.has_texcoord) else 16
+        faces = materialize(look_up(scene.triangles.surface[:count], hits.face), zero)
 
     def at(depth: Array) -> tuple[Array, Vector, Vector]:
         point = (origin[0] + depth * direction[0], origin[1] + depth * direction[1], origin[2] + depth * direction[2])
@@ -78,8 +79,13 @@ def surface_of(
         smooth = affine(faces[4:16], local)
         _, outward = select(is_face, (depth, (smooth[0], smooth[1], smooth[2])), (depth, outward))
         normal = _turned_back(turn, materialize(outward, zero), away, zero)
-    point = (x * depth, y * depth, -depth)
-    return depth, Surface(point, normal, flat, (rows[10], rows[11], rows[12]), rows[13], rows[14], rows[15])
+    point, rgb, tint = (x * depth, y * depth, -depth), (rows[10], rows[11], rows[12]), None
+    if scene.textures is not None:
+        texcoord = affine(faces[16:24], local) if faces is not None and len(faces) == 24 else None
+        local = materialize(local, zero)
+        tint = texturing.colour(scene.textures, hits.slot, starts, (size, local), texcoord)
+        tint = materialize(tint, zero)
+    return depth, Surface(point, normal, flat, rgb, rows[13], rows[14], rows[15], tint)
 
 
 def _turned_back(turn: tuple[Array, Array, Array, Array], outward: Vector, away: Array, zero: Array) -> Vector:

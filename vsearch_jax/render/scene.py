@@ -10,6 +10,7 @@ from jax import Array
 from mujoco import mjtGeom, mjtLightType
 
 from vsearch_jax.render.rays import RAY_FUNCTIONS
+from vsearch_jax.render.textures import Textures, compile_textures, rgb_texture
 from vsearch_jax.render.triangles import TRIANGLE_TYPES, Triangles, compile_triangles
 
 # What MuJoCo's renderer assumes of a geom without a material (mjv_initGeom) ...
@@ -71,12 +72,13 @@ class RenderScene:
       shininess: f32[G], exponent of the specular highlight (128 times MuJoCo's value).
       emission: f32[G], light given off, in units of `rgb`.
       triangles: the faces of meshes and height fields, or None without such geoms.
+      textures: of the geoms and the sky, or None without any.
       lights: Lights.
       headlight_ambient: f32[3], of the light that shines along the camera's axis.
       headlight_diffuse: f32[3].
       headlight_specular: f32[3].
       ambient: f32[3], light from nowhere.
-      background: f32[3] in [0, 1], colour of a miss.
+      background: f32[3] in [0, 1], colour of a miss where the model has no skybox.
       shadow_offset: f32[] m, how far shadow rays start off a surface.
       geom_ids: MuJoCo's number of each visible geom; sorted by type, those made of triangles last; static.
       geom_types: mjtGeom of each visible geom; static.
@@ -89,6 +91,7 @@ class RenderScene:
     shininess: Array
     emission: Array
     triangles: Triangles | None
+    textures: Textures | None
     lights: Lights
     headlight_ambient: Array
     headlight_diffuse: Array
@@ -109,8 +112,8 @@ class RenderScene:
 def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1, 2)) -> RenderScene:
     """Returns the visible geoms, materials and lights of `mj_model`.
 
-    A geom is left out where its colour has alpha 0 or its group is not chosen; any other alpha counts as 1. A skybox is
-    not drawn: set `background`.
+    A geom is left out where its colour has alpha 0 or its group is not chosen; any other alpha counts as 1, also that
+    of textures. Of a material's textures that of the colour counts, of several skyboxes the first.
 
     Args:
       mj_model: the compiled model.
@@ -142,6 +145,7 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
         shininess=_f32(_SHININESS_SCALE * _material_values(mj_model, mj_model.mat_shininess, _DEFAULT_SHININESS)[ids]),
         emission=_f32(_material_values(mj_model, mj_model.mat_emission, 0.0)[ids]),
         triangles=compile_triangles(mj_model, ids[np.isin(mj_model.geom_type[ids], TRIANGLE_TYPES)]),
+        textures=compile_textures(mj_model, ids),
         lights=lights,
         headlight_ambient=_f32(headlight.ambient * is_headlight_on),
         headlight_diffuse=_f32(headlight.diffuse * is_headlight_on),
@@ -179,10 +183,11 @@ def _check_geom(model: mujoco.MjModel, geom: int) -> None:
             f"{name} is of type {mjtGeom(kind).name}, which cannot be rendered; replace it by primitives or a mesh, "
             "give it alpha 0 or leave out its group"
         )
-    material = int(model.geom_matid[geom])
-    if material >= 0 and np.any(model.mat_texid[material] >= 0):
+    texture = rgb_texture(model, geom)
+    if texture >= 0 and model.tex_nchannel[texture] not in (3, 4):
         raise RenderError(
-            f"{name} has the textured material {model.mat(material).name!r}; textures cannot be rendered: remove it"
+            f"{name} has the texture {model.tex(texture).name!r} of {model.tex_nchannel[texture]} channels, "
+            "which cannot be rendered; give it three"
         )
 
 

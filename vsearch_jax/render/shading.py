@@ -24,6 +24,7 @@ class Surface(NamedTuple):
       specular: f32[H, W].
       shininess: f32[H, W].
       emission: f32[H, W].
+      tint: three f32[H, W], by which a texture multiplies the lit colour, or None without textures.
     """
 
     point: Vector
@@ -33,6 +34,7 @@ class Surface(NamedTuple):
     specular: Array
     shininess: Array
     emission: Array
+    tint: Vector | None
 
 
 class Incidence(NamedTuple):
@@ -114,5 +116,6 @@ def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> 
         for (ambient, diffuse, specular), light in zip(colours, incidences, strict=True):
             matte += light.strength * (ambient[i] + diffuse[i] * light.diffuse)
             gloss += light.strength * specular[i] * light.specular
-        channels.append(jnp.clip(surface.rgb[i] * matte + surface.specular * gloss, 0.0, 1.0))
+        lit = jnp.clip(surface.rgb[i] * matte + surface.specular * gloss, 0.0, 1.0)
+        channels.append(lit if surface.tint is None else lit * surface.tint[i])
     return channels

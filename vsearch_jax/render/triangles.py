@@ -25,7 +25,7 @@ class Triangles:
 
     Attributes:
       corners: f32[3, 3, T] m; corner, axis, face; counterclockwise as seen from outside.
-      surface: f32[20, T], of each face: the unit normal n and the offset d of its plane n p = d; the 3 x 4 affine map
+      surface: f32[24, T], of each face: the unit normal n and the offset d of its plane n p = d; the 3 x 4 affine map
         from a point to the direction of the smooth normal there, row by row; the 2 x 4 one to texture coordinates.
       geom: i32[T], 0 to M - 1, the face's geom, counted from the scene's first geom that is made of triangles.
       low: f32[M, 3] m, corner of the geom's bounding box.
@@ -113,7 +113,7 @@ def _flat_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _surface(corners: np.ndarray, normals: np.ndarray, texcoords: np.ndarray | None) -> np.ndarray:
-    """Returns f64[F, 20], the rows of `Triangles.surface`."""
+    """Returns f64[F, 24], the rows of `Triangles.surface`."""
     flat = _flat_normals(corners)
     offset = np.sum(flat * corners.mean(axis=1), axis=-1, keepdims=True)
     texcoords = np.zeros((len(corners), 3, 2)) if texcoords is None else texcoords
