@@ -51,13 +51,14 @@ class Image:
       rgb: f32[H, W, 3] in [0, 1].
       depth: f32[H, W] m along the optical axis, +inf on a miss.
       geom_id: i32[H, W], MuJoCo's geom number, -1 on a miss.
-      normal: f32[H, W, 3], unit, in world, of the surface as it is lit, towards the camera; 0 on a miss.
+      normal: f32[H, W, 3], unit, in world, of the surface as it is lit, towards the camera; 0 on a miss. Pictures
+        that are not drawn have none.
     """
 
     rgb: Array
     depth: Array
     geom_id: Array
-    normal: Array
+    normal: Array | None = None
 
 
 @flax.struct.dataclass

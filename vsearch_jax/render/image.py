@@ -141,8 +141,7 @@ def supersample(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, 
     fine = render(scene, data, magnified(camera, factor), (factor * size[0], factor * size[1]))
     rgb = fine.rgb.reshape(size[0], factor, size[1], factor, 3).mean(axis=(1, 3))
     middle = slice(factor // 2, None, factor)
-    depth, geom_id, normal = (plane[middle, middle] for plane in (fine.depth, fine.geom_id, fine.normal))
-    return Image(rgb, depth, geom_id, normal)
+    return jax.tree.map(lambda plane: plane[middle, middle], fine).replace(rgb=rgb)
 
 
 def _frames(scene: RenderScene, data: Any, camera: Camera) -> trace.Frames:

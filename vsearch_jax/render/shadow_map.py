@@ -19,7 +19,7 @@ from vsearch_jax.render.rays import Vector, dot
 from vsearch_jax.render.scene import RenderScene
 
 # Cells of a map along an edge, for each pixel of the image's longer edge.
-_CELLS_PER_PIXEL = 1.5
+_CELLS_PER_PIXEL = 1.0
 # Tangent of the widest angle that a light sees.
 _WIDEST = 5.7
 # The depth of a cell is compared at its middle, with that of the surface's own plane there. The plane is trusted no
