@@ -163,4 +163,4 @@ def _raster(scene: RenderScene, frames: trace.Frames, pixels: Pinhole, size: tup
     origin = frames.origin[scene.num_primitives :]
     is_outside = jnp.any((origin < triangles.low) | (origin > triangles.high), axis=1)
     pose = trace.poses(frames, scene.num_primitives)
-    return rasterize(triangles, View(pose, triangles.is_closed * is_outside, pixels, False), size, zero)
+    return rasterize(triangles, View(pose, jnp.where(is_outside, triangles.is_closed, 0.0), pixels, False), size, zero)

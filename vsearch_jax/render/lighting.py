@@ -34,7 +34,8 @@ def light_poses(scene: RenderScene, data: Any, camera: Camera) -> LightPoses:
         position, direction = scene.lights.position[index], scene.lights.direction[index]
         if body:
             rotation = jnp.asarray(data.xmat[body], dtype=jnp.float32).reshape(3, 3)
-            position, direction = rotation @ position + data.xpos[body], rotation @ direction
+            body_position = jnp.asarray(data.xpos[body], dtype=jnp.float32)
+            position, direction = rotation @ position + body_position, rotation @ direction
         positions.append(camera.rotation.T @ (position - camera.position))
         directions.append(camera.rotation.T @ direction)
     if not positions:

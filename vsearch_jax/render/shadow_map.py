@@ -101,7 +101,7 @@ def cast(
     triangles = scene.triangles
     assert triangles is not None
     (point, is_hit), (place, is_directional) = seen, light
-    count = jnp.maximum(jnp.sum(is_hit), 1)
+    count = jnp.maximum(jnp.sum(is_hit), 1).astype(jnp.float32)
     middle = jnp.stack([jnp.sum(jnp.where(is_hit, axis, 0.0)) / count for axis in point])
     toward = place if is_directional else place - middle
     rotation = _frame(toward / jnp.sqrt(jnp.maximum(toward @ toward, 1e-20)))
@@ -111,7 +111,7 @@ def cast(
     low = jnp.stack([jnp.min(jnp.where(is_seen, axis, jnp.inf)) for axis in (x, y)])
     high = jnp.stack([jnp.max(jnp.where(is_seen, axis, -jnp.inf)) for axis in (x, y)])
     start = scene.num_primitives
-    center = (frames.center[start:] - origin) @ rotation.T
+    center = (frames.center[start:] - origin[None]) @ rotation.T
     caster_low, caster_high = _bounds_of_casters(center, triangles.radius, is_directional)
     pixel_count = is_hit.size
     cells = min(1024, int(_CELLS_PER_PIXEL * pixel_count**0.5))
@@ -124,7 +124,8 @@ def cast(
     is_culled = triangles.is_closed
     if not is_directional:
         local = frames.rotation[start:] @ place + frames.origin[start:]
-        is_culled = is_culled * jnp.any((local < triangles.low) | (local > triangles.high), axis=1)
+        is_outside = jnp.any((local < triangles.low) | (local > triangles.high), axis=1)
+        is_culled = jnp.where(is_outside, is_culled, 0.0)
     raster = rasterize(triangles, View(pose, is_culled, pinhole, is_directional), (cells, cells), zero)
     return ShadowMap(raster.depth, rotation, origin, pinhole)
 

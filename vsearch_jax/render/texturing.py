@@ -94,7 +94,7 @@ def _cube(way: Vector) -> tuple[Coordinates, Array]:
     v = jnp.where(is_x, -y, jnp.where(is_y, jnp.sign(y) * z, -y))
     major = jnp.maximum(jnp.where(is_x, ax, jnp.where(is_y, ay, az)), _TINY)
     sign = jnp.where(is_x, x, jnp.where(is_y, y, z))
-    side = jnp.where(is_x, 0, jnp.where(is_y, 2, 4)) + (sign < 0.0)
+    side = jnp.where(is_x, 0, jnp.where(is_y, 2, 4)) + jnp.where(sign < 0.0, 1, 0)
     return (0.5 + 0.5 * u / major, 0.5 + 0.5 * v / major), side.astype(jnp.int32)
 
 
@@ -120,7 +120,7 @@ def _texel(textures: Textures, index: Array) -> Vector:
 
 def _neighbours(coordinate: Array, count: Array, is_cube: Array) -> list[tuple[Array, Array]]:
     """Returns the two texels next to a coordinate along one axis, with their weights."""
-    place = coordinate * count - 0.5
+    place = coordinate * count.astype(jnp.float32) - 0.5
     first = jax.lax.stop_gradient(jnp.floor(place))
     weight, result = place - first, []
     for step, share in ((0, 1.0 - weight), (1, weight)):
