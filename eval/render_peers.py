@@ -39,7 +39,7 @@ class Case:
 
 def mesh_case(num_faces: int, batch: int) -> Case:
     """Returns a lumpy ball of about `num_faces` faces that covers a quarter of a square image, alone."""
-    count = round((num_faces / 4) ** 0.5) + 1
+    count = round((num_faces / 8) ** 0.5) + 1  # trimesh makes about 8 count^2 faces of them
     ball = trimesh.creation.uv_sphere(radius=1.0, count=[count, 2 * count])
     x, y, z = ball.vertices.T
     vertices = ball.vertices * (0.1 * (1.0 + 0.1 * np.sin(7.0 * x) * np.cos(5.0 * y + 3.0 * z)))[:, None]

@@ -20,7 +20,7 @@ _REACH = 3
 
 def _moved(points: Array, geom: Array, data: Any, camera: Camera) -> Array:
     """Returns f32[H, W, 3], in the camera's frame, `points` of it that move with their geoms and the camera."""
-    rotation, position = data.geom_xmat.reshape(-1, 3, 3)[geom], jnp.asarray(data.geom_xpos)[geom]
+    rotation, position = jnp.asarray(data.geom_xmat).reshape(-1, 3, 3)[geom], jnp.asarray(data.geom_xpos)[geom]
     world = jax.lax.stop_gradient(points @ camera.rotation.T + camera.position[None, None])
     fixed_rotation, fixed_position = jax.lax.stop_gradient((rotation, position))
     local = jnp.einsum("hwji,hwj->hwi", fixed_rotation, world - fixed_position)

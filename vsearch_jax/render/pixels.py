@@ -15,7 +15,7 @@ from vsearch_jax.render.shading import Surface
 from vsearch_jax.render.surface import affine, level, select
 
 
-def look_up(table: Array, index: Array) -> list[Array]:
+def look_up(table: Array | list[Array], index: Array) -> list[Array]:
     """Returns for each row of `table` [P, N] the entry of each pixel's `index`, [H, W].
 
     One gather a row: XLA on CPU vectorises neither a long chain of selects nor a gather of whole rows.
@@ -34,9 +34,10 @@ def _rotate(quaternion: tuple[Array, Array, Array, Array], vector: Vector) -> Ve
 def _geom_rows(scene: RenderScene, frames: trace.Frames, slot: Array, zero: Array) -> list[Array]:
     """Returns each pixel's geom: rotation (4), origin (3), size (3), colour (3), specular, shininess, emission."""
     quaternion = jax.vmap(SO3.from_matrix)(frames.rotation).wxyz
-    columns = [quaternion, frames.origin, scene.size, scene.rgb]
-    columns += [v[:, None] for v in (scene.specular, scene.shininess, scene.emission)]
-    return materialize(look_up(materialize(jnp.concatenate(columns, axis=1).T, zero), slot), zero)
+    placed = materialize(jnp.concatenate([quaternion, frames.origin], axis=1).T, zero)
+    # Apart from the poses: a table that all images of a batch share is looked up in half the time.
+    worn = [*scene.size.T, *scene.rgb.T, scene.specular, scene.shininess, scene.emission]
+    return materialize(look_up(placed, slot) + look_up(worn, slot), zero)
 
 
 def surface_of(

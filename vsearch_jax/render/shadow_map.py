@@ -2,8 +2,8 @@
 
 A ray from every pixel to the light would look for faces in no order; the light's own view finds them as the camera's
 does. It is cut to what both holds a face and is seen, so that its cells are about as large as the image's pixels are
-there: shadows end where they should to about a pixel. A light sees 80 degrees to each side of the middle of what the
-camera sees; beyond, only primitives cast its shadows.
+there: shadows end where they should to about a pixel. A light that is not at infinity sees 80 degrees to each side of
+the direction to the middle of the meshes; beyond, only primitives cast its shadows.
 """
 
 from __future__ import annotations
@@ -101,8 +101,8 @@ def cast(
     triangles = scene.triangles
     assert triangles is not None
     (point, is_hit), (place, is_directional) = seen, light
-    count = jnp.maximum(jnp.sum(is_hit), 1).astype(jnp.float32)
-    middle = jnp.stack([jnp.sum(jnp.where(is_hit, axis, 0.0)) / count for axis in point])
+    start = scene.num_primitives
+    middle = jnp.mean(frames.center[start:], axis=0)
     toward = place if is_directional else place - middle
     rotation = _frame(toward / jnp.sqrt(jnp.maximum(toward @ toward, 1e-20)))
     origin = middle if is_directional else place
@@ -110,7 +110,6 @@ def cast(
     is_seen &= is_hit
     low = jnp.stack([jnp.min(jnp.where(is_seen, axis, jnp.inf)) for axis in (x, y)])
     high = jnp.stack([jnp.max(jnp.where(is_seen, axis, -jnp.inf)) for axis in (x, y)])
-    start = scene.num_primitives
     center = (frames.center[start:] - origin[None]) @ rotation.T
     caster_low, caster_high = _bounds_of_casters(center, triangles.radius, is_directional)
     pixel_count = is_hit.size
