@@ -83,7 +83,7 @@ def _directions(case: Case, size: int) -> np.ndarray:
 def ours(case: Case, size: int, has_shadows: bool) -> Callable[[], object]:
     """Returns a call that draws colour, depth and geom numbers of the whole batch in one program."""
     scene = render.compile_scene(case.model).replace(has_shadows=has_shadows)
-    data = _Poses(case.data)
+    data = render.poses(case.data)
 
     def one(position: jax.Array, rotation: jax.Array) -> object:
         return render.render(scene, data, Camera(position, rotation, jnp.float32(FOVY)), (size, size))
@@ -91,16 +91,6 @@ def ours(case: Case, size: int, has_shadows: bool) -> Callable[[], object]:
     program = jax.jit(jax.vmap(one))
     positions, rotations = (jnp.asarray(a, dtype=jnp.float32) for a in (case.positions, case.rotations))
     return lambda: jax.block_until_ready(program(positions, rotations))
-
-
-class _Poses:
-    """The part of mjx.Data that the renderer reads."""
-
-    def __init__(self, data: mujoco.MjData) -> None:
-        self.geom_xpos = jnp.asarray(data.geom_xpos, dtype=jnp.float32)
-        self.geom_xmat = jnp.asarray(data.geom_xmat.reshape(-1, 3, 3), dtype=jnp.float32)
-        self.xpos = jnp.asarray(data.xpos, dtype=jnp.float32)
-        self.xmat = jnp.asarray(data.xmat.reshape(-1, 3, 3), dtype=jnp.float32)
 
 
 def multi_ray(case: Case, size: int) -> Callable[[], object]:

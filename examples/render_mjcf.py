@@ -6,21 +6,18 @@ import jax
 import matplotlib.image
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from vsearch_jax import render
 
 
-def main(mjcf: str, camera_name: str, picture: str) -> None:
-    """Draws what the camera `camera_name` of the file `mjcf` sees in the model's initial pose."""
+def main(mjcf: str, camera: str, picture: str) -> None:
+    """Draws what the camera of that name sees in the model's initial pose."""
     model = mujoco.MjModel.from_xml_path(mjcf)
-    scene = render.compile_scene(model)
-    data = mjx.kinematics(mjx_model := mjx.put_model(model), mjx.make_data(mjx_model))
-    data = mjx.camlight(mjx_model, mjx.com_pos(mjx_model, data))
-    camera = render.camera(data, model, camera_name)
-    image = jax.jit(render.supersample, static_argnames=("size", "factor"))(
-        scene, data, camera, size=(480, 640), factor=3
-    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene, poses = render.compile_scene(model), render.poses(data)
+    draw = jax.jit(render.supersample, static_argnames=("size", "factor"))
+    image = draw(scene, poses, render.camera(poses, model, camera), size=(480, 640), factor=3)
     matplotlib.image.imsave(picture, np.asarray(image.rgb))
 
 

@@ -3,10 +3,12 @@
 from vsearch_jax.render.camera import camera, camera_from_matrix, camera_from_pose
 from vsearch_jax.render.image import render, silhouette, supersample
 from vsearch_jax.render.outline import Square, crop, soft_silhouette, square_around
+from vsearch_jax.render.poses import Poses, poses
 from vsearch_jax.render.scene import Lights, RenderError, RenderScene, compile_scene
 
 __all__ = [
     "Lights",
+    "Poses",
     "RenderError",
     "RenderScene",
     "Square",
@@ -15,6 +17,7 @@ __all__ = [
     "camera_from_pose",
     "compile_scene",
     "crop",
+    "poses",
     "render",
     "silhouette",
     "soft_silhouette",
