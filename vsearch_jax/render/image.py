@@ -51,13 +51,15 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
     """Returns what `camera` sees.
 
     Depth and geom_id are those of C MuJoCo's `mj_ray` through the pixels' centres; colours follow MuJoCo's light model,
-    evaluated in every pixel, with sharp shadows. There is no near or far plane. Light and camera belong outside of all
-    solids: a wall seen from inside is lit as from outside, and shadows in there are not right. Derivatives are those of
-    the geom that each pixel shows: finite, and blind to outlines and to the edges of shadows.
+    evaluated in every pixel, with sharp shadows: those of primitives are exact, those of meshes and height fields to
+    about a pixel. There is no near or far plane. Light and camera belong outside of all solids: a wall seen from inside
+    is lit as from outside, and shadows in there are not right. Derivatives are those of the geom that each pixel shows:
+    finite, and blind to outlines and to the edges of shadows.
 
     Args:
       scene: RenderScene.
-      data: mjx.Data, or anything with geom_xpos f32[ngeom, 3] m and geom_xmat f32[ngeom, 3, 3], geom to world.
+      data: mjx.Data, Poses, or anything with geom_xpos f32[ngeom, 3] m and geom_xmat f32[ngeom, 3, 3], geom to world,
+        and, if bodies carry lights, xpos and xmat likewise.
       camera: Camera.
       size: height and width in pixels, static.
 
@@ -71,7 +73,8 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
     zero = unknown_zero(frames.origin)
     pixels = pinhole(camera, size)
     # Else the tangent and the products behind these would be computed anew in every pixel.
-    frames, lights, pixels, rays = materialize((frames, lights, pixels, pixel_rays(pixels, size)), zero)
+    rotation, rays = camera.rotation, pixel_rays(pixels, size)
+    frames, rotation, lights, pixels, rays = materialize((frames, rotation, lights, pixels, rays), zero)
     fixed_scene, fixed_frames, fixed_lights, fixed_pixels = jax.lax.stop_gradient((scene, frames, lights, pixels))
     raster, shadows = None, {}
     if scene.triangles is not None:
@@ -83,7 +86,7 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
         hits = jax.lax.map(functools.partial(_hits, fixed_scene, fixed_frames), fixed_tiles)
         seen = (x * hits.depth, y * hits.depth, -hits.depth), hits.is_hit
         shadows = shadow_maps(fixed_scene, fixed_frames, fixed_lights, seen, zero)
-    sight = _Sight(frames, camera.rotation, lights, shadows, zero)
+    sight = _Sight(frames, rotation, lights, shadows, zero)
     parts = jax.lax.map(functools.partial(_render_tile, scene, sight), tiles)
     return jax.tree.map(tiling.join, parts)
 
