@@ -33,7 +33,7 @@ def soft_silhouette(
     camera: Camera,
     size: tuple[int, int],
     geom_ids: tuple[int, ...],
-    softness: float = 1.0,
+    softness: float = 0.7,
 ) -> Array:
     """Returns how far each pixel is within the outline of some geoms, with derivatives that move the outline.
 
@@ -81,8 +81,8 @@ def _distance(mask: Array, shift: Array) -> Array:
         # The outline is half a pixel beyond the last point that is seen; it moves with the point of the two within.
         within = jnp.where(mask[..., None], shift, wide_shift[other])
         along = (within[..., 0] * i + within[..., 1] * j) / length
-        # Seen from outside the other pixel is within, and the outline comes nearer as its point comes.
-        distance = jnp.where(mask, -(length - 0.5) + along, length - 0.5 + along)
+        # `along` points away from an inner pixel, towards the point of an outer one.
+        distance = jnp.where(mask, -(length - 0.5) - along, length - 0.5 + along)
         is_nearer = (wide_mask[other] != mask) & (length - 0.5 < jnp.abs(jax.lax.stop_gradient(best)))
         best = jnp.where(is_nearer, distance, best)
     return best
