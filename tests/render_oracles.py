@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 from mujoco import mjtGeom, mjtLightType
 
+# Of the random scenes, meshes and a height field among them.
+MOST_GEOMS = 40
 SOLIDS = tuple(getattr(mjtGeom, f"mjGEOM_{name}") for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"))
 
 
@@ -33,10 +35,46 @@ def random_size(kind: int, rng: np.random.Generator) -> np.ndarray:
     return size
 
 
-def random_scene(rng: np.random.Generator, num_geoms: int = 20, light: mjtLightType | None = None) -> mujoco.MjModel:
+def potato(rng: np.random.Generator, count: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    """Returns f64[V, 3] m and i32[2 (count - 1) 2 count, 3]: a closed mesh, star-shaped, with hills and hollows."""
+    polar, around = np.linspace(0.0, np.pi, count + 1), np.linspace(0.0, 2 * np.pi, 2 * count, endpoint=False)
+    ring = np.stack([np.cos(around), np.sin(around), np.zeros_like(around)], axis=-1)
+    rings = np.sin(polar[1:-1])[:, None, None] * ring + np.cos(polar[1:-1])[:, None, None] * [0.0, 0.0, 1.0]
+    vertices = np.concatenate([[[0.0, 0.0, 1.0]], rings.reshape(-1, 3), [[0.0, 0.0, -1.0]]])
+    vertices *= rng.uniform(0.7, 1.3, size=(len(vertices), 1)) * rng.uniform(0.08, 0.3, size=3)
+    here = 1 + np.arange(2 * count * (count - 1)).reshape(count - 1, 2 * count)
+    there, last = np.roll(here, -1, axis=1), len(vertices) - 1
+    faces = [np.stack([np.zeros_like(here[0]), here[0], there[0]], axis=-1)]
+    faces += [
+        np.stack([here[:-1], here[1:], there[1:]], axis=-1),
+        np.stack([here[:-1], there[1:], there[:-1]], axis=-1),
+    ]
+    faces += [np.stack([np.full_like(here[0], last), there[-1], here[-1]], axis=-1)]
+    return vertices, np.concatenate([f.reshape(-1, 3) for f in faces])
+
+
+def add_triangles(spec: mujoco.MjSpec, rng: np.random.Generator, num_meshes: int, is_open: bool = False) -> list:
+    """Adds a height field and `num_meshes` meshes, each in its body, every other without its last face if `is_open`."""
+    field = spec.add_hfield(name="field", nrow=7, ncol=9, size=[0.5, 0.4, 0.2, 0.1], userdata=rng.uniform(size=63))
+    body = spec.worldbody.add_body(pos=rng.uniform(-0.7, 0.7, size=3), quat=rng.normal(size=4))
+    geoms = [body.add_geom(type=mjtGeom.mjGEOM_HFIELD, hfieldname=field.name)]
+    for index in range(num_meshes):
+        vertices, faces = potato(rng)
+        faces = faces[: -1 if is_open and index % 2 else None]
+        name, shell = f"mesh{index}", mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        spec.add_mesh(name=name, uservert=vertices.reshape(-1), userface=faces.reshape(-1), inertia=shell)
+        body = spec.worldbody.add_body(pos=rng.uniform(-0.9, 0.9, size=3), quat=rng.normal(size=4))
+        geoms.append(body.add_geom(type=mjtGeom.mjGEOM_MESH, meshname=name))
+    return geoms
+
+
+def random_scene(
+    rng: np.random.Generator, num_geoms: int = 20, light: mjtLightType | None = None, num_meshes: int = 0
+) -> mujoco.MjModel:
     """A finite and an endless plane and `num_geoms` solids, each in its body, before a camera `eye` at random.
 
-    With a `light`, a white scene and a single light, ambient only: what it reaches is white, its shadows are black.
+    With `num_meshes`, a height field and that many meshes are added, every other of them open. With a `light`, a white
+    scene and a single light, ambient only: what it reaches is white, its shadows are black; meshes are closed then.
     """
     spec = mujoco.MjSpec()
     world = spec.worldbody
@@ -47,6 +85,8 @@ def random_scene(rng: np.random.Generator, num_geoms: int = 20, light: mjtLightT
         kind = SOLIDS[index % len(SOLIDS)]
         body = world.add_body(pos=rng.uniform(-0.9, 0.9, size=3), quat=rng.normal(size=4))
         geoms.append(body.add_geom(type=kind, size=random_size(kind, rng) * 0.5))
+    if num_meshes:
+        geoms += add_triangles(spec, rng, num_meshes, is_open=light is None)
     for geom in geoms:
         geom.rgba = [1, 1, 1, 1] if light is not None else [*rng.uniform(0.2, 0.9, size=3), 1]
     if light is not None:

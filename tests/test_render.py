@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from mujoco import mjtGeom, mjtLightType
 
 from render_oracles import (
+    MOST_GEOMS,
     cast_image,
     forward,
     on_outline,
@@ -117,7 +118,25 @@ _render = jax.jit(render.render, static_argnames="size")
 @given(seed=SEEDS)
 @settings(max_examples=15)
 def test_image_equals_mj_multi_ray(seed: int) -> None:
-    model = random_scene(np.random.default_rng(seed))
+    _assert_equals_mj_multi_ray(random_scene(np.random.default_rng(seed)))
+
+
+@given(seed=SEEDS)
+@settings(max_examples=10)
+def test_image_with_meshes_equals_mj_multi_ray(seed: int) -> None:
+    _assert_equals_mj_multi_ray(random_scene(np.random.default_rng(seed), num_geoms=10, num_meshes=6))
+
+
+@pytest.mark.slow
+@given(seed=SEEDS, num_geoms=st.sampled_from((0, 5, 15, 25)), num_meshes=st.sampled_from((0, 1, 4, 12)))
+@settings(max_examples=250)
+def test_many_images_equal_mj_multi_ray(seed: int, num_geoms: int, num_meshes: int) -> None:
+    model = random_scene(np.random.default_rng(seed), num_geoms=num_geoms, num_meshes=num_meshes)
+    assert model.ngeom <= MOST_GEOMS
+    _assert_equals_mj_multi_ray(model)
+
+
+def _assert_equals_mj_multi_ray(model: mujoco.MjModel) -> None:
     data = forward(model)
     depth, ids = cast_image(model, data, 0, SIZE)
     frames = poses(model, data)
@@ -323,20 +342,16 @@ def test_gradients_are_finite_and_follow_the_surface() -> None:
 
 
 def test_unsupported_models_raise_by_name() -> None:
-    mesh = mujoco.MjModel.from_xml_string("""
-      <mujoco><asset><mesh name="t" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
-      <worldbody><geom name="tetra" type="mesh" mesh="t"/></worldbody></mujoco>""")
-    with pytest.raises(render.RenderError, match=r"'tetra'.*mjGEOM_MESH"):
-        render.compile_scene(mesh)
+    tracking, _ = _small('<body><joint/><geom size=".1"/><light name="torch" mode="trackcom"/></body>')
+    with pytest.raises(render.RenderError, match=r"'torch'.*mjCAMLIGHT_TRACKCOM"):
+        render.compile_scene(tracking)
     texture = mujoco.MjModel.from_xml_string("""
       <mujoco><asset><texture name="c" type="2d" builtin="checker" width="8" height="8"/>
       <material name="tiles" texture="c"/></asset>
       <worldbody><geom name="floor" type="plane" size="1 1 1" material="tiles"/></worldbody></mujoco>""")
-    with pytest.raises(render.RenderError, match=r"'floor'.*'tiles'"):
+    texture.tex_nchannel[0] = 1
+    with pytest.raises(render.RenderError, match=r"'floor'.*'c' of 1 channels"):
         render.compile_scene(texture)
-    moving, _ = _small('<body><joint/><geom size=".1"/><light name="torch"/></body>')
-    with pytest.raises(render.RenderError, match=r"'torch'.*moves"):
-        render.compile_scene(moving)
     model, data = _small()
     with pytest.raises(render.RenderError, match="geom_groups"):
         render.compile_scene(model, geom_groups=(5,))

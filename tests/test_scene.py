@@ -1,9 +1,11 @@
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 from second_arm import MJCF
 from vsearch_jax.config import SceneConfig
+from vsearch_jax.meshes import inspect, read_mesh
 from vsearch_jax.scene import SceneError, available, build_scene, xml_folder
 
 # SPEC.md 2: KUKA LWR 4+.
@@ -175,6 +177,47 @@ def test_a_bad_file_is_told_in_one_line(tmp_path, part, content, words):
     assert "\n" not in message
     for word in [str(path), *words]:
         assert word in message
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "glb", "off"])
+def test_meshes_of_every_format_stand_alike(tmp_path, suffix, caplog):
+    path = tmp_path / f"part.{suffix}"
+    shape = trimesh.creation.box((0.1, 0.06, 0.04), transform=trimesh.transformations.translation_matrix((3, 4, 5)))
+    path.write_bytes(as_bytes(shape.export(file_type=suffix)))
+    scene = build_scene(SceneConfig(object=str(path)))
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    geom = scene.object_geom_ids[0]
+    vertices = scene.mj_model.mesh_vert @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    np.testing.assert_allclose(vertices.min(axis=0), [-0.05, -0.03, 0], atol=1e-6)
+    np.testing.assert_allclose(vertices.max(axis=0), [0.05, 0.03, 0.04], atol=1e-6)
+    assert not caplog.records
+
+
+def as_bytes(exported: str | bytes) -> bytes:
+    return exported.encode() if isinstance(exported, str) else exported
+
+
+def test_a_mesh_with_holes_is_taken_and_reported(tmp_path, caplog):
+    shape = trimesh.creation.box((0.1, 0.06, 0.04))
+    faces = np.concatenate([shape.faces[1:], [[0, 0, 1]]])
+    path = tmp_path / "part.ply"
+    path.write_bytes(trimesh.Trimesh(shape.vertices, faces, process=False).export(file_type="ply"))
+    assert (
+        str(inspect(*read_mesh(path))) == "12 faces, 1 of them without area, 3 edges at holes, size 0.1 x 0.06 x 0.04"
+    )
+    build_scene(SceneConfig(object=str(path)))
+    assert "3 edges at holes" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("size", "words"), [(85.0, "85 m long.*millimetres.*0.001"), (1e-3, "0.001 m long.*in metres")]
+)
+def test_a_mesh_of_another_unit_is_told(tmp_path, size, words):
+    path = tmp_path / "part.stl"
+    path.write_bytes(trimesh.creation.box((size, size, size)).export(file_type="stl"))
+    with pytest.raises(SceneError, match=rf"part\.stl.*{words}"):
+        build_scene(SceneConfig(object=str(path)))
 
 
 def test_a_bad_mesh_and_an_unknown_name_are_told(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -12,12 +13,14 @@ import numpy as np
 from mujoco import mjx
 
 from vsearch_jax.config import SceneConfig
+from vsearch_jax.meshes import MESH_SUFFIXES, MeshError, check, is_read_by_mujoco, read_mesh
 
 ARM_PREFIX = "arm/"
 OBJECT_PREFIX = "object/"
 TCP_SITE = "tcp"
 WRIST_CAMERA = "wrist"
-MESH_SUFFIXES = (".obj", ".stl")
+
+_LOG = logging.getLogger(__name__)
 
 
 class SceneError(ValueError):
@@ -76,18 +79,19 @@ def build_scene(config: SceneConfig) -> Scene:
     """Assembles table, lights, mount, arm and object into one model.
 
     The arm's base hangs from the mount, its +z pointing down. The object stands fixed at the world's origin; joints of
-    its file are dropped. A mesh is put with its lowest point on the table and the middle of its bounding box over the
-    origin.
+    its file are dropped. A mesh (OBJ, STL, MSH, PLY, GLB and what else trimesh reads; in metres) is put with its lowest
+    point on the table and the middle of its bounding box over the origin; holes and faces without area are logged.
 
     Args:
       config: names or paths of arm and object, mount height and view sphere.
 
     Raises:
       SceneError: a name is unknown, a file is missing or cannot be loaded, the arm has no site `tcp`, no camera `wrist`
-        or no joint that moves the camera, has a joint that is neither a hinge nor a slide, or the object has no geom.
+        or no joint that moves the camera, has a joint that is neither a hinge nor a slide, the object has no geom, or
+        it is a mesh too large or too small to be looked at.
     """
     arm_path, object_path = _find("arm", config.arm), _find("object", config.object)
-    arm, target = _load_arm(arm_path), _load_object(object_path)
+    arm, target = _load_arm(arm_path), _load_object(object_path, config.radius)
     spec = mujoco.MjSpec.from_file(str(xml_folder() / "scene.xml"))
     mount = spec.body("mount")
     mount.pos = [0.0, 0.0, config.mount_height]
@@ -161,9 +165,12 @@ def _load_arm(path: Path) -> mujoco.MjSpec:
     return spec
 
 
-def _load_object(path: Path) -> mujoco.MjSpec:
+def _load_object(path: Path, largest: float) -> mujoco.MjSpec:
     if path.suffix.lower() in MESH_SUFFIXES:
-        return _load_mesh(path)
+        try:
+            return _load_mesh(path, largest)
+        except (MeshError, ValueError) as error:
+            raise SceneError(f"object file {str(path)!r} cannot be loaded: {_one_line(error)}") from error
     spec = _load("object", path)
     for joint in list(spec.joints):
         spec.delete(joint)
@@ -172,20 +179,26 @@ def _load_object(path: Path) -> mujoco.MjSpec:
     return spec
 
 
-def _load_mesh(path: Path) -> mujoco.MjSpec:
+def _load_mesh(path: Path, largest: float) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
-    spec.add_mesh(name="mesh", file=str(path))
+    # The object does not move, so a mesh with holes, which has no volume, is as good as another.
+    mesh = spec.add_mesh(name="mesh", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    if is_read_by_mujoco(path):
+        mesh.file = str(path)
+    else:
+        vertices, faces = read_mesh(path)
+        mesh.uservert, mesh.userface = vertices.reshape(-1), faces.reshape(-1)
     geom = spec.worldbody.add_body(name="mesh").add_geom(
         name="mesh", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", rgba=[0.75, 0.55, 0.35, 1.0]
     )
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise SceneError(f"object file {str(path)!r} cannot be loaded: {_one_line(error)}") from error
+    model = spec.compile()
     # MuJoCo moved the vertices into the frame of the mesh's inertia; this is the way back to the file's frame.
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.mesh_quat[0])
     vertices = model.mesh_vert @ rotation.reshape(3, 3).T + model.mesh_pos[0]
+    report = check(vertices, model.mesh_face, largest)
+    if report.num_degenerate or report.num_open_edges:
+        _LOG.warning("object file %r: %s", str(path), report)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     geom.pos = [-(low[0] + high[0]) / 2.0, -(low[1] + high[1]) / 2.0, -low[2]]
     return spec

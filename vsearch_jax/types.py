@@ -32,12 +32,15 @@ class Camera:
     Attributes:
       position: f32[3] m, of the optical centre in world.
       rotation: f32[3, 3], camera to world; columns are the camera's x, y, z axes; it looks along -z.
-      fovy: f32[] rad, vertical field of view.
+      fovy: f32[] rad, vertical field of view; not used with intrinsics.
+      intrinsics: f32[4] pixels, or None: focal lengths fx and fy and principal point cx and cy, as a calibration gives
+        them, with the centre of the first pixel at (0, 0) and y down. They hold for one image size.
     """
 
     position: Array
     rotation: Array
     fovy: Array
+    intrinsics: Array | None = None
 
 
 @flax.struct.dataclass
@@ -48,11 +51,14 @@ class Image:
       rgb: f32[H, W, 3] in [0, 1].
       depth: f32[H, W] m along the optical axis, +inf on a miss.
       geom_id: i32[H, W], MuJoCo's geom number, -1 on a miss.
+      normal: f32[H, W, 3], unit, in world, of the surface as it is lit, towards the camera; 0 on a miss. Pictures
+        that are not drawn have none.
     """
 
     rgb: Array
     depth: Array
     geom_id: Array
+    normal: Array | None = None
 
 
 @flax.struct.dataclass

@@ -9,6 +9,7 @@ import mujoco
 from jax import Array
 from jaxlie import SE3
 
+from vsearch_jax.render.raster import Pinhole
 from vsearch_jax.render.scene import RenderError
 from vsearch_jax.types import Camera
 
@@ -47,21 +48,50 @@ def camera_from_pose(T_world_camera: SE3, fovy: Array | float) -> Camera:
     )
 
 
-def pixel_rays(fovy: Array, size: tuple[int, int]) -> tuple[Array, Array]:
+def camera_from_matrix(T_world_camera: SE3, matrix: Array) -> Camera:
+    """Returns the camera with a calibrated camera's matrix.
+
+    Args:
+      T_world_camera: pose of the camera, which looks along its own -z with +y up. OpenCV's looks along +z with +y down:
+        turn its pose by pi around its x axis.
+      matrix: f32[3, 3] pixels, ((fx, 0, cx), (0, fy, cy), (0, 0, 1)), for the size of the images that are drawn.
+    """
+    intrinsics = jnp.stack([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]).astype(jnp.float32)
+    return camera_from_pose(T_world_camera, 0.0).replace(intrinsics=intrinsics)
+
+
+def magnified(camera: Camera, factor: int) -> Camera:
+    """Returns the camera that sees the same in images `factor` times as large."""
+    if camera.intrinsics is None:
+        return camera
+    focal, center = camera.intrinsics[:2], camera.intrinsics[2:]
+    return camera.replace(intrinsics=jnp.concatenate([factor * focal, factor * (center + 0.5) - 0.5]))
+
+
+def pinhole(camera: Camera, size: tuple[int, int]) -> Pinhole:
+    """Returns how `camera` maps onto an image of height and width `size`."""
+    if camera.intrinsics is not None:
+        return Pinhole(*camera.intrinsics)
+    height, width = size
+    scale = 0.5 * height / jnp.tan(0.5 * camera.fovy)
+    center_x, center_y = (jnp.full_like(scale, 0.5 * (count - 1)) for count in (width, height))
+    return Pinhole(scale, scale, center_x, center_y)
+
+
+def pixel_rays(pinhole: Pinhole, size: tuple[int, int]) -> tuple[Array, Array]:
     """Returns the slopes of the rays through the pixels' centres.
 
     The ray of pixel (row, column) runs along (x, y, -1) in the camera's frame, so a distance along it, in units of that
-    vector, is a depth along the optical axis. Pixels are square.
+    vector, is a depth along the optical axis.
 
     Args:
-      fovy: f32[] rad.
+      pinhole: Pinhole.
       size: height and width in pixels.
 
     Returns:
       x of each column, f32[1, W], and y of each row, f32[H, 1].
     """
     height, width = size
-    scale = 2.0 * jnp.tan(0.5 * fovy) / height
-    columns = jnp.arange(width, dtype=jnp.float32) - 0.5 * (width - 1)
-    rows = 0.5 * (height - 1) - jnp.arange(height, dtype=jnp.float32)
-    return (scale * columns)[None, :], (scale * rows)[:, None]
+    columns = jnp.arange(width, dtype=jnp.float32) - pinhole.center_x
+    rows = pinhole.center_y - jnp.arange(height, dtype=jnp.float32)
+    return (columns / pinhole.scale_x)[None, :], (rows / pinhole.scale_y)[:, None]

@@ -10,6 +10,8 @@ from jax import Array
 from mujoco import mjtGeom, mjtLightType
 
 from vsearch_jax.render.rays import RAY_FUNCTIONS
+from vsearch_jax.render.textures import Textures, compile_textures, rgb_texture
+from vsearch_jax.render.triangles import TRIANGLE_TYPES, Triangles, compile_triangles
 
 # What MuJoCo's renderer assumes of a geom without a material (mjv_initGeom) ...
 _DEFAULT_SPECULAR, _DEFAULT_SHININESS = 0.5, 0.5
@@ -28,7 +30,7 @@ class RenderError(ValueError):
 
 @flax.struct.dataclass
 class Lights:
-    """The active lights of a model, all in world; L is their number.
+    """The active lights of a model, each in the frame of the body that carries it; L is their number.
 
     Attributes:
       position: f32[L, 3] m; not used by directional lights.
@@ -41,6 +43,7 @@ class Lights:
       exponent: f32[L], a spot's intensity falls off its axis with this power of the cosine.
       is_directional: for each light; static.
       is_shadowing: for each light; static.
+      bodies: for each light the body that carries it, 0 for one that is fixed in the world; static.
     """
 
     position: Array
@@ -53,6 +56,7 @@ class Lights:
     exponent: Array
     is_directional: tuple[bool, ...] = flax.struct.field(pytree_node=False)
     is_shadowing: tuple[bool, ...] = flax.struct.field(pytree_node=False)
+    bodies: tuple[int, ...] = flax.struct.field(pytree_node=False)
 
 
 @flax.struct.dataclass
@@ -67,14 +71,16 @@ class RenderScene:
       specular: f32[G] in [0, 1].
       shininess: f32[G], exponent of the specular highlight (128 times MuJoCo's value).
       emission: f32[G], light given off, in units of `rgb`.
+      triangles: the faces of meshes and height fields, or None without such geoms.
+      textures: of the geoms and the sky, or None without any.
       lights: Lights.
       headlight_ambient: f32[3], of the light that shines along the camera's axis.
       headlight_diffuse: f32[3].
       headlight_specular: f32[3].
       ambient: f32[3], light from nowhere.
-      background: f32[3] in [0, 1], colour of a miss.
+      background: f32[3] in [0, 1], colour of a miss where the model has no skybox.
       shadow_offset: f32[] m, how far shadow rays start off a surface.
-      geom_ids: MuJoCo's number of each visible geom; sorted by type; static.
+      geom_ids: MuJoCo's number of each visible geom; sorted by type, those made of triangles last; static.
       geom_types: mjtGeom of each visible geom; static.
       has_shadows: whether lights cast shadows; static.
     """
@@ -84,6 +90,8 @@ class RenderScene:
     specular: Array
     shininess: Array
     emission: Array
+    triangles: Triangles | None
+    textures: Textures | None
     lights: Lights
     headlight_ambient: Array
     headlight_diffuse: Array
@@ -95,19 +103,24 @@ class RenderScene:
     geom_types: tuple[int, ...] = flax.struct.field(pytree_node=False)
     has_shadows: bool = flax.struct.field(pytree_node=False, default=True)
 
+    @property
+    def num_primitives(self) -> int:
+        """The number of geoms that are not made of triangles, which come first."""
+        return sum(kind not in TRIANGLE_TYPES for kind in self.geom_types)
+
 
 def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1, 2)) -> RenderScene:
     """Returns the visible geoms, materials and lights of `mj_model`.
 
-    A geom is left out where its colour has alpha 0 or its group is not chosen; any other alpha counts as 1. A skybox is
-    not drawn: set `background`.
+    A geom is left out where its colour has alpha 0 or its group is not chosen; any other alpha counts as 1, also that
+    of textures. Of a material's textures that of the colour counts, of several skyboxes the first.
 
     Args:
       mj_model: the compiled model.
       geom_groups: the geom groups that are drawn; MuJoCo's own renderer draws these by default.
 
     Raises:
-      RenderError: a visible geom is of a type or has a texture that is not supported, a light moves, follows a body or
+      RenderError: a visible geom is of a type or has a texture that is not supported, a light tracks a body or
         is an image, or no geom is visible.
     """
     rgba = _shown_rgba(mj_model)
@@ -119,7 +132,8 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
         )
     for geom in visible:
         _check_geom(mj_model, int(geom))
-    ids = visible[np.argsort(mj_model.geom_type[visible], kind="stable")]
+    kinds = mj_model.geom_type[visible]
+    ids = visible[np.lexsort((kinds, np.isin(kinds, TRIANGLE_TYPES)))]
     lights = _compile_lights(mj_model)
     headlight = mj_model.vis.headlight
     is_headlight_on = float(headlight.active > 0)
@@ -130,6 +144,8 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
         specular=_f32(_material_values(mj_model, mj_model.mat_specular, _DEFAULT_SPECULAR)[ids]),
         shininess=_f32(_SHININESS_SCALE * _material_values(mj_model, mj_model.mat_shininess, _DEFAULT_SHININESS)[ids]),
         emission=_f32(_material_values(mj_model, mj_model.mat_emission, 0.0)[ids]),
+        triangles=compile_triangles(mj_model, ids[np.isin(mj_model.geom_type[ids], TRIANGLE_TYPES)]),
+        textures=compile_textures(mj_model, ids),
         lights=lights,
         headlight_ambient=_f32(headlight.ambient * is_headlight_on),
         headlight_diffuse=_f32(headlight.diffuse * is_headlight_on),
@@ -162,15 +178,16 @@ def _material_values(model: mujoco.MjModel, values: np.ndarray, default: float) 
 def _check_geom(model: mujoco.MjModel, geom: int) -> None:
     name = f"geom {model.geom(geom).name!r} (number {geom})"
     kind = int(model.geom_type[geom])
-    if kind not in RAY_FUNCTIONS:
+    if kind not in RAY_FUNCTIONS and kind not in TRIANGLE_TYPES:
         raise RenderError(
-            f"{name} is of type {mjtGeom(kind).name}, which cannot be rendered; replace it by primitives, "
+            f"{name} is of type {mjtGeom(kind).name}, which cannot be rendered; replace it by primitives or a mesh, "
             "give it alpha 0 or leave out its group"
         )
-    material = int(model.geom_matid[geom])
-    if material >= 0 and np.any(model.mat_texid[material] >= 0):
+    texture = rgb_texture(model, geom)
+    if texture >= 0 and model.tex_nchannel[texture] not in (3, 4):
         raise RenderError(
-            f"{name} has the textured material {model.mat(material).name!r}; textures cannot be rendered: remove it"
+            f"{name} has the texture {model.tex(texture).name!r} of {model.tex_nchannel[texture]} channels, "
+            "which cannot be rendered; give it three"
         )
 
 
@@ -182,10 +199,11 @@ def _compile_lights(model: mujoco.MjModel) -> Lights:
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_camlight(model, data)
+    bodies = np.where(model.body_weldid[model.light_bodyid[active]] == 0, 0, model.light_bodyid[active])
     is_point = model.light_type[active] == mjtLightType.mjLIGHT_POINT
     return Lights(
-        position=_f32(data.light_xpos[active]),
-        direction=_f32(data.light_xdir[active]),
+        position=_f32(np.where(bodies[:, None] > 0, model.light_pos[active], data.light_xpos[active])),
+        direction=_f32(np.where(bodies[:, None] > 0, model.light_dir[active], data.light_xdir[active])),
         ambient=_f32(model.light_ambient[active]),
         diffuse=_f32(model.light_diffuse[active]),
         specular=_f32(model.light_specular[active]),
@@ -194,6 +212,7 @@ def _compile_lights(model: mujoco.MjModel) -> Lights:
         exponent=_f32(np.where(is_point, 0.0, model.light_exponent[active])),
         is_directional=tuple(bool(t == mjtLightType.mjLIGHT_DIRECTIONAL) for t in model.light_type[active]),
         is_shadowing=tuple(bool(c) for c in model.light_castshadow[active]),
+        bodies=tuple(int(b) for b in bodies),
     )
 
 
@@ -201,8 +220,6 @@ def _check_light(model: mujoco.MjModel, light: int) -> None:
     name = f"light {model.light(light).name!r} (number {light})"
     if model.light_type[light] == mjtLightType.mjLIGHT_IMAGE:
         raise RenderError(f"{name} is an image light, which cannot be rendered; use type directional, spot or point")
-    is_fixed = model.light_mode[light] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
-    if model.body_weldid[model.light_bodyid[light]] != 0 or not is_fixed:
-        raise RenderError(
-            f"{name} moves; only lights fixed to the world can be rendered: give it mode fixed, in the worldbody"
-        )
+    if model.light_mode[light] != mujoco.mjtCamLight.mjCAMLIGHT_FIXED:
+        mode = mujoco.mjtCamLight(model.light_mode[light]).name
+        raise RenderError(f"{name} has mode {mode}, which cannot be rendered: give it mode fixed, in any body")

@@ -18,19 +18,23 @@ class Surface(NamedTuple):
 
     Attributes:
       point: three f32[H, W] m.
-      normal: three f32[H, W], unit, towards the camera's side.
+      normal: three f32[H, W], unit, towards the camera's side, of the smooth surface that a face stands for.
+      flat: three f32[H, W], the same of the face itself; `normal` elsewhere.
       rgb: three f32[H, W] in [0, 1].
       specular: f32[H, W].
       shininess: f32[H, W].
       emission: f32[H, W].
+      tint: three f32[H, W], by which a texture multiplies the lit colour, or None without textures.
     """
 
     point: Vector
     normal: Vector
+    flat: Vector
     rgb: Vector
     specular: Array
     shininess: Array
     emission: Array
+    tint: Vector | None
 
 
 class Incidence(NamedTuple):
@@ -112,5 +116,6 @@ def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> 
         for (ambient, diffuse, specular), light in zip(colours, incidences, strict=True):
             matte += light.strength * (ambient[i] + diffuse[i] * light.diffuse)
             gloss += light.strength * specular[i] * light.specular
-        channels.append(jnp.clip(surface.rgb[i] * matte + surface.specular * gloss, 0.0, 1.0))
+        lit = jnp.clip(surface.rgb[i] * matte + surface.specular * gloss, 0.0, 1.0)
+        channels.append(lit if surface.tint is None else lit * surface.tint[i])
     return channels

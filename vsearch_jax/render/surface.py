@@ -1,4 +1,4 @@
-"""The primitives as level sets: F(point) = 0 on the surface, and F's gradient points outwards."""
+"""The geoms as level sets: F(point) = 0 on the surface, and F's gradient points outwards."""
 
 from __future__ import annotations
 
@@ -74,12 +74,21 @@ def level(slot: Array, starts: tuple[tuple[int, int], ...], size: Vector, point:
     Returns:
       f32[H, W], and three f32[H, W] in the geom's frame. On an edge the gradient is the sum of the faces' gradients.
     """
-    kind, _ = starts[0]
-    value, slope = LEVEL_FUNCTIONS[kind](size, point)
-    for kind, start in starts[1:]:
-        is_later = slot >= start
-        other_value, other_slope = LEVEL_FUNCTIONS[kind](size, point)
-        value = jnp.where(is_later, other_value, value)
-        x, y, z = (jnp.where(is_later, b, a) for a, b in zip(slope, other_slope, strict=True))
-        slope = (x, y, z)
-    return value, slope
+    zero = jnp.zeros_like(point[0])
+    result: Level = (zero, (zero, zero, zero + 1.0))
+    for kind, start in starts:
+        other = LEVEL_FUNCTIONS[kind](size, point)
+        result = other if start == 0 else select(slot >= start, other, result)
+    return result
+
+
+def select(condition: Array, a: Level, b: Level) -> Level:
+    """Returns `a` where `condition`, elsewhere `b`."""
+    x, y, z = (jnp.where(condition, i, j) for i, j in zip(a[1], b[1], strict=True))
+    return jnp.where(condition, a[0], b[0]), (x, y, z)
+
+
+def affine(rows: list[Array], point: Vector) -> list[Array]:
+    """Returns the values at `point` of the affine maps whose coefficients are `rows`, four a value."""
+    x, y, z = point
+    return [a * x + b * y + c * z + d for a, b, c, d in zip(*(rows[i::4] for i in range(4)), strict=True)]

@@ -8,6 +8,7 @@ with the most.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 from mujoco import mjtGeom
 
+from vsearch_jax.render.raster import Raster
 from vsearch_jax.render.rays import CHORD_FUNCTIONS, RAY_FUNCTIONS, Vector, dot
 from vsearch_jax.render.scene import RenderScene
 
@@ -45,16 +47,19 @@ class Hits(NamedTuple):
       slot: i32[H, W], row of the geom in the scene; 0 on a miss.
       depth: f32[H, W] m; 1 on a miss. From `nearest` it is exact up to the bits that held the row.
       is_hit: bool[H, W].
+      face: i32[H, W], the face that is hit, where it is one; 0 elsewhere.
     """
 
     slot: Array
     depth: Array
     is_hit: Array
+    face: Array
 
 
 def type_starts(scene: RenderScene) -> tuple[tuple[int, int], ...]:
-    """Returns each geom type of the scene with its first row."""
-    return tuple((kind, scene.geom_types.index(kind)) for kind in sorted(set(scene.geom_types)))
+    """Returns each type of primitive of the scene with its first row."""
+    kinds = scene.geom_types[: scene.num_primitives]
+    return tuple((kind, kinds.index(kind)) for kind in sorted(set(kinds)))
 
 
 def bounding_radius(scene: RenderScene) -> Array:
@@ -68,7 +73,10 @@ def bounding_radius(scene: RenderScene) -> Array:
         "mjGEOM_CYLINDER": jnp.sqrt(x * x + y * y),
         "mjGEOM_BOX": jnp.sqrt(x * x + y * y + z * z),
     }
-    return jnp.stack([radii[mjtGeom(kind).name][row] for row, kind in enumerate(scene.geom_types)])
+    kinds = scene.geom_types[: scene.num_primitives]
+    primitives = [radii[mjtGeom(kind).name][row] for row, kind in enumerate(kinds)]
+    others = [] if scene.triangles is None else [*scene.triangles.radius]
+    return jnp.stack(primitives + others)
 
 
 def apply(rotation: Array, vector: Vector, offset: Array | None = None) -> Vector:
@@ -99,9 +107,8 @@ def _minimum_over_geoms(
     scene: RenderScene, is_kept: Array, value: Callable[[int, Array], Array], initial: Array
 ) -> Array:
     """Returns the pixelwise minimum of `initial` and `value(type, row)` over the rows where `is_kept`."""
-    best, starts = initial, type_starts(scene)
-    stops = [start for _, start in starts[1:]] + [len(scene.geom_types)]
-    for (kind, start), stop in zip(starts, stops, strict=True):
+    best = initial
+    for (kind, start), (_, stop) in itertools.pairwise((*type_starts(scene), (-1, scene.num_primitives))):
         rank = jnp.cumsum(is_kept[start:stop])
         visit = functools.partial(_visit, value, kind, start, rank)
         _, best = jax.lax.while_loop(functools.partial(_is_left, rank), visit, (jnp.zeros_like(rank[0]), best))
@@ -120,7 +127,7 @@ def _in_view(frames: Frames, x: Array, y: Array) -> Array:
 
 
 def nearest(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
-    """Returns the nearest geom of each pixel.
+    """Returns the nearest primitive of each pixel.
 
     The row number stands in the low bits of the depth's bit pattern. Bit patterns order as the depths do, so that one
     minimum finds both.
@@ -131,7 +138,7 @@ def nearest(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
       x: f32[1, W], slopes of the pixels' rays.
       y: f32[H, 1].
     """
-    mask = (1 << max(1, (len(scene.geom_types) - 1).bit_length())) - 1
+    mask = (1 << max(1, (scene.num_primitives - 1).bit_length())) - 1
     ray = (x, y, -jnp.ones_like(x))
 
     def packed_depth(kind: int, row: Array) -> Array:
@@ -143,7 +150,27 @@ def nearest(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
     packed = _minimum_over_geoms(scene, _in_view(frames, x, y), packed_depth, initial)
     is_hit = packed < _INFINITY_BITS
     depth = jax.lax.bitcast_convert_type(packed & ~mask, jnp.float32)
-    return Hits(jnp.where(is_hit, packed & mask, 0), jnp.where(is_hit, depth, 1.0), is_hit)
+    slot = jnp.where(is_hit, packed & mask, 0)
+    return Hits(slot, jnp.where(is_hit, depth, 1.0), is_hit, jnp.zeros_like(slot))
+
+
+def poses(frames: Frames, start: int) -> Array:
+    """Returns f32[12, G - start]: the poses of the geoms from row `start` on, as `raster.View` has them."""
+    rotation = frames.rotation[start:].transpose(0, 2, 1)
+    return jnp.concatenate([rotation, frames.center[start:, :, None]], axis=2).reshape(-1, 12).T
+
+
+def nearer(scene: RenderScene, hits: Hits, raster: Raster) -> Hits:
+    """Returns the hits with those faces of `raster` that are nearer."""
+    assert scene.triangles is not None
+    is_nearer = raster.depth < jnp.where(hits.is_hit, hits.depth, jnp.inf)
+    geom = scene.triangles.geom.at[raster.face].get(mode="promise_in_bounds")
+    return Hits(
+        jnp.where(is_nearer, scene.num_primitives + geom, hits.slot),
+        jnp.where(is_nearer, raster.depth, hits.depth),
+        hits.is_hit | is_nearer,
+        jnp.where(is_nearer, raster.face, 0),
+    )
 
 
 def is_lit(

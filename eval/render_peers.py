@@ -1,0 +1,149 @@
+"""The renderer and its peers on the same scene and cameras, each as a function that draws a batch once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import trimesh
+
+import vsearch_jax as vs
+from vsearch_jax import geometry, render
+from vsearch_jax.types import Camera, View
+
+FOVY = 0.8
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model in its initial pose, and cameras around it.
+
+    Attributes:
+      model: with a camera `eye`.
+      data: of `model`.
+      positions: f64[B, 3] m.
+      rotations: f64[B, 3, 3], camera to world.
+    """
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    positions: np.ndarray
+    rotations: np.ndarray
+
+
+def mesh_case(num_faces: int, batch: int) -> Case:
+    """Returns a lumpy ball of about `num_faces` faces that covers a quarter of a square image, alone."""
+    count = round((num_faces / 8) ** 0.5) + 1  # trimesh makes about 8 count^2 faces of them
+    ball = trimesh.creation.uv_sphere(radius=1.0, count=[count, 2 * count])
+    x, y, z = ball.vertices.T
+    vertices = ball.vertices * (0.1 * (1.0 + 0.1 * np.sin(7.0 * x) * np.cos(5.0 * y + 3.0 * z)))[:, None]
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="ball", uservert=vertices.reshape(-1), userface=ball.faces.reshape(-1))
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="ball", rgba=[0.8, 0.5, 0.3, 1.0])
+    # A disc that covers a quarter of the square has a radius of 0.28 of its edge.
+    return _around(spec, np.zeros(3), 0.1 / (2 * 0.28 * np.tan(FOVY / 2)), batch)
+
+
+def project_case(batch: int) -> Case:
+    """Returns the project's own scene: arm, table and the object of the preset `cpu`."""
+    scene = vs.build_scene(vs.Config.preset("cpu").scene)
+    return _cameras(scene.mj_model, np.asarray(scene.center), scene.radius, batch)
+
+
+def _around(spec: mujoco.MjSpec, center: np.ndarray, distance: float, batch: int) -> Case:
+    spec.visual.global_.offwidth = spec.visual.global_.offheight = 512
+    return _cameras(spec.compile(), center, distance, batch)
+
+
+def _cameras(model: mujoco.MjModel, center: np.ndarray, distance: float, batch: int) -> Case:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    positions, rotations = [], []
+    for index in range(batch):
+        pose = geometry.view_pose(View(jnp.float32(2.4 * index), jnp.float32(0.5)), jnp.asarray(center), distance)
+        positions.append(np.asarray(pose.translation(), np.float64))
+        rotations.append(np.asarray(pose.rotation().as_matrix(), np.float64))
+    return Case(model, data, np.stack(positions), np.stack(rotations))
+
+
+def _directions(case: Case, size: int) -> np.ndarray:
+    """Returns f64[B, H W, 3], rays in world whose part along the optical axis is 1."""
+    slopes = (np.arange(size) - 0.5 * (size - 1)) * 2.0 * np.tan(FOVY / 2) / size
+    columns, rows = np.meshgrid(slopes, -slopes)
+    local = np.stack([columns, rows, -np.ones_like(rows)], axis=-1).reshape(-1, 3)
+    return np.einsum("bij,pj->bpi", case.rotations, local)
+
+
+def ours(case: Case, size: int, has_shadows: bool) -> Callable[[], object]:
+    """Returns a call that draws colour, depth and geom numbers of the whole batch in one program."""
+    scene = render.compile_scene(case.model).replace(has_shadows=has_shadows)
+    data = render.poses(case.data)
+
+    def one(position: jax.Array, rotation: jax.Array) -> object:
+        return render.render(scene, data, Camera(position, rotation, jnp.float32(FOVY)), (size, size))
+
+    program = jax.jit(jax.vmap(one))
+    positions, rotations = (jnp.asarray(a, dtype=jnp.float32) for a in (case.positions, case.rotations))
+    return lambda: jax.block_until_ready(program(positions, rotations))
+
+
+def multi_ray(case: Case, size: int) -> Callable[[], object]:
+    """Returns a call that casts the rays of the batch with mj_multiRay on all cores: depth and geom numbers only."""
+    directions, count = _directions(case, size), size * size
+    pool = ThreadPoolExecutor(os.cpu_count())
+
+    def one(index: int) -> tuple[np.ndarray, np.ndarray]:
+        ids, distances = np.zeros(count, np.int32), np.zeros(count)
+        origin, rays = case.positions[index], directions[index].reshape(-1)
+        args = (origin, rays, None, True, -1, ids, distances, None, count, mujoco.mjMAXVAL)
+        mujoco.mj_multiRay(case.model, case.data, *args)  # it releases the interpreter's lock
+        return ids, distances
+
+    return lambda: list(pool.map(one, range(len(directions))))
+
+
+def opengl(case: Case, size: int) -> Callable[[], object]:
+    """Returns a call that draws the batch's colours with mujoco.Renderer, one after another.
+
+    Raises:
+      Exception: there is no OpenGL here.
+    """
+    renderer = mujoco.Renderer(case.model, size, size)
+    camera = mujoco.MjvCamera()
+
+    def one(index: int) -> np.ndarray:
+        renderer.update_scene(case.data, camera)
+        for eye in renderer.scene.camera:
+            eye.pos, eye.forward, eye.up = case.positions[index], *(case.rotations[index].T[[2, 1]] * [[-1.0], [1.0]])
+            half = np.tan(FOVY / 2) * eye.frustum_near
+            eye.frustum_bottom, eye.frustum_top, eye.frustum_center = -half, half, 0.0
+            eye.frustum_width = half
+        return renderer.render()
+
+    return lambda: [one(index) for index in range(len(case.positions))]
+
+
+def embree(case: Case, size: int) -> Callable[[], object]:
+    """Returns a call that casts the rays of the batch at the model's only mesh with embree on one core.
+
+    Raises:
+      ImportError: embreex is not installed.
+    """
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+    mesh = trimesh.Trimesh(case.model.mesh_vert, case.model.mesh_face, process=False)
+    rotation = case.data.geom_xmat[0].reshape(3, 3)
+    intersector = RayMeshIntersector(mesh)
+    rays = (_directions(case, size) @ rotation).astype(np.float32)
+    origins = ((case.positions - case.data.geom_xpos[0]) @ rotation).astype(np.float32)
+
+    def one(index: int) -> np.ndarray:
+        return intersector.intersects_first(np.broadcast_to(origins[index], rays[index].shape), rays[index])
+
+    return lambda: [one(index) for index in range(len(rays))]

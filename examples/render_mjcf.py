@@ -1,0 +1,25 @@
+"""Draws a camera of any MJCF: `python examples/render_mjcf.py examples/workshop.xml room docs/workshop.png`."""
+
+import sys
+
+import jax
+import matplotlib.image
+import mujoco
+import numpy as np
+
+from vsearch_jax import render
+
+
+def main(mjcf: str, camera: str, picture: str) -> None:
+    """Draws what the camera of that name sees in the model's initial pose."""
+    model = mujoco.MjModel.from_xml_path(mjcf)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene, poses = render.compile_scene(model), render.poses(data)
+    draw = jax.jit(render.supersample, static_argnames=("size", "factor"))
+    image = draw(scene, poses, render.camera(poses, model, camera), size=(480, 640), factor=3)
+    matplotlib.image.imsave(picture, np.asarray(image.rgb))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
