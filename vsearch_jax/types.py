@@ -6,6 +6,7 @@ Frames: `world` is MuJoCo's world frame (z up); a camera looks along its own -z 
 
 from __future__ import annotations
 
+import enum
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -55,6 +56,14 @@ class Image:
     geom_id: Array
 
 
+class IKStatus(enum.IntEnum):
+    """How an inverse-kinematics problem ended: solved, no start led there, or pose or joints were NaN or infinite."""
+
+    SOLVED = 0
+    UNREACHABLE = 1
+    NOT_FINITE = 2
+
+
 @flax.struct.dataclass
 class IKResult:
     """The outcome of one inverse-kinematics problem.
@@ -62,14 +71,16 @@ class IKResult:
     Attributes:
       qpos: f32[nq] rad or m; inside the joint limits.
       position_error: f32[] m.
-      rotation_error: f32[] rad, geodesic.
+      rotation_error: f32[] rad, geodesic; with a free roll, of the optical axis.
       is_converged: bool[], both errors are within the tolerances of the config.
+      status: i32[], an IKStatus.
     """
 
     qpos: Array
     position_error: Array
     rotation_error: Array
     is_converged: Array
+    status: Array
 
 
 @flax.struct.dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,11 +44,15 @@ class IKConfig:
     """Starts of `ik`: the present joints and others spread over the limits."""
     num_iterations: int = 16
     """Iterations from each start."""
+    num_nullspace_steps: int = 6
+    """Steps of `ik` along the redundancy, towards the present joints and away from the limits."""
+    is_roll_free: bool = False
+    """Whether the camera may turn about its optical axis."""
     damping: float = 1e-3
     """Initial damping of the normal equations."""
     position_tolerance: float = 1e-3
     """Converged below this error in m."""
-    rotation_tolerance_deg: float = 0.5
+    rotation_tolerance_deg: float = 0.1
     """Converged below this error in degrees."""
     map_azimuths: int = 72
     """Cells of the reachability map around the object."""
@@ -71,6 +76,12 @@ class IKConfig:
             "map_iterations",
         )
         require(self, "map_elevations", self.map_elevations >= 2, "2 or more")
+        require(self, "num_nullspace_steps", self.num_nullspace_steps >= 0, "0 or more")
+
+    @property
+    def rotation_tolerance(self) -> float:
+        """`rotation_tolerance_deg` in rad."""
+        return math.radians(self.rotation_tolerance_deg)
 
 
 @dataclass(frozen=True)
