@@ -12,7 +12,7 @@ from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import IKConfig, SceneConfig
 from vsearch_jax.geometry import view_pose
 from vsearch_jax.planning import ik, ik_from_starts, nearest_cell, reachability_map, solve_view, start_limits
-from vsearch_jax.planning.ik import rank
+from vsearch_jax.planning.starts import rank
 from vsearch_jax.scene import build_scene
 from vsearch_jax.types import IKResult, View
 
@@ -112,7 +112,8 @@ def test_ik_keeps_joints_that_solve_already_and_prefers_the_nearest(arm):
 def test_rank_puts_valid_before_converged_before_the_rest():
     error = jnp.asarray([0.0, 0.0, 0.0, 0.2, 0.1, jnp.nan])
     is_converged = jnp.asarray([True, True, True, False, False, False])
-    results = IKResult(qpos=jnp.zeros((6, 9)), position_error=error, rotation_error=error, is_converged=is_converged)
+    status = jnp.zeros(6, jnp.int32)
+    results = IKResult(jnp.zeros((6, 9)), error, error, is_converged, status)
     is_valid = jnp.asarray([False, True, True, False, False, False])
     travel = jnp.asarray([0.0, 2.0, 1.0, 0.0, 3.0, 0.0])
     np.testing.assert_array_equal(jnp.argsort(rank(results, is_valid, travel)), [2, 1, 0, 4, 3, 5])

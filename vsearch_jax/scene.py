@@ -15,6 +15,7 @@ from vsearch_jax.config import SceneConfig
 
 ARM_PREFIX = "arm/"
 OBJECT_PREFIX = "object/"
+OBSTACLE_PREFIX = "obstacle/"
 TCP_SITE = "tcp"
 WRIST_CAMERA = "wrist"
 MESH_SUFFIXES = (".obj", ".stl")
@@ -42,6 +43,7 @@ class Scene:
       arm_geom_ids: geoms of the arm, its fixed base included.
       mount_geom_ids: geoms of the mount.
       object_geom_ids: geoms of the object.
+      obstacle_geom_ids: geoms of whatever else stands around.
       table_geom_id: the table plane.
     """
 
@@ -58,6 +60,7 @@ class Scene:
     arm_geom_ids: tuple[int, ...]
     mount_geom_ids: tuple[int, ...]
     object_geom_ids: tuple[int, ...]
+    obstacle_geom_ids: tuple[int, ...]
     table_geom_id: int
 
 
@@ -68,7 +71,7 @@ def xml_folder() -> Path:
 
 
 def available(kind: str) -> tuple[str, ...]:
-    """Returns the names of the arms (`kind` "arm") or objects ("objects") that come with the package."""
+    """Returns the names of what comes with the package: `kind` is "arm", "objects" or "obstacles"."""
     return tuple(sorted(path.stem for path in (xml_folder() / kind).glob("*.xml")))
 
 
@@ -80,7 +83,7 @@ def build_scene(config: SceneConfig) -> Scene:
     origin.
 
     Args:
-      config: names or paths of arm and object, mount height and view sphere.
+      config: names or paths of arm, object and obstacles, mount height and view sphere.
 
     Raises:
       SceneError: a name is unknown, a file is missing or cannot be loaded, the arm has no site `tcp`, no camera `wrist`
@@ -93,6 +96,9 @@ def build_scene(config: SceneConfig) -> Scene:
     mount.pos = [0.0, 0.0, config.mount_height]
     _attach(spec, arm, mount, ARM_PREFIX)
     _attach(spec, target, spec.body("object"), OBJECT_PREFIX)
+    if config.obstacles is not None:
+        still = _load_still("obstacles", _find("obstacles", config.obstacles))
+        _attach(spec, still, spec.body("obstacles"), OBSTACLE_PREFIX)
     try:
         model = spec.compile()
     except ValueError as error:
@@ -116,12 +122,13 @@ def build_scene(config: SceneConfig) -> Scene:
         arm_geom_ids=tuple(g for g in _geoms_below(model, mount_id) if model.geom_bodyid[g] != mount_id),
         mount_geom_ids=tuple(np.flatnonzero(model.geom_bodyid == mount_id).tolist()),
         object_geom_ids=_geoms_below(model, object_id),
+        obstacle_geom_ids=_geoms_below(model, model.body("obstacles").id),
         table_geom_id=model.geom("table").id,
     )
 
 
 def _find(part: str, name: str) -> Path:
-    folder = "arm" if part == "arm" else "objects"
+    folder = "objects" if part == "object" else part
     path = Path(name).expanduser()
     if path.suffix or path.parent != Path("."):
         if not path.is_file():
@@ -164,11 +171,16 @@ def _load_arm(path: Path) -> mujoco.MjSpec:
 def _load_object(path: Path) -> mujoco.MjSpec:
     if path.suffix.lower() in MESH_SUFFIXES:
         return _load_mesh(path)
-    spec = _load("object", path)
-    for joint in list(spec.joints):
-        spec.delete(joint)
+    spec = _load_still("object", path)
     if not spec.geoms:
         raise SceneError(f"object file {str(path)!r} has no geom; there is nothing to look at")
+    return spec
+
+
+def _load_still(part: str, path: Path) -> mujoco.MjSpec:
+    spec = _load(part, path)
+    for joint in list(spec.joints):
+        spec.delete(joint)
     return spec
 
 

@@ -83,6 +83,30 @@ class IKResult:
     status: Array
 
 
+class PlanStatus(enum.IntEnum):
+    """How a planning problem ended; see `vsearch_jax.planning.rrt_connect`."""
+
+    FOUND = 0
+    EXHAUSTED = 1
+    START_BLOCKED = 2
+    GOAL_BLOCKED = 3
+
+
+@flax.struct.dataclass
+class Path:
+    """A joint path of straight pieces.
+
+    Attributes:
+      waypoints: f32[W, nq] rad or m, from start to goal; the goal repeats to the end. All are the start without a path.
+      length: f32[] rad (or m), sum of the Euclidean lengths in joint space; +inf without a path.
+      status: i32[], a PlanStatus.
+    """
+
+    waypoints: Array
+    length: Array
+    status: Array
+
+
 @flax.struct.dataclass
 class ReachabilityMap:
     """Which views of a grid the arm can reach, and with which joints.

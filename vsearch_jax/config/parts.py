@@ -17,6 +17,8 @@ class SceneConfig:
     """A name in xml/arm, or the path of an MJCF file with a site `tcp` and a camera `wrist`."""
     object: str = "teapot"
     """A name in xml/objects, or the path of an MJCF file with one body of primitive geoms."""
+    obstacles: str | None = None
+    """What else stands around: a name in xml/obstacles, or the path of an MJCF file in world coordinates."""
     mount_height: float = 1.355
     """Height in m of the arm's base above the table; the arm hangs from it."""
     radius: float = 0.35
@@ -82,6 +84,29 @@ class IKConfig:
     def rotation_tolerance(self) -> float:
         """`rotation_tolerance_deg` in rad."""
         return math.radians(self.rotation_tolerance_deg)
+
+
+@dataclass(frozen=True)
+class PlanningConfig:
+    """Collision-free joint paths and their timing."""
+
+    num_nodes: int = 512
+    """Nodes of a tree, at most."""
+    max_iterations: int = 2048
+    """Edges that are tried for one problem, at most."""
+    step: float = 1.5
+    """Length in rad of a tree's random edges."""
+    resolution: float = 0.004
+    """How near in m the arm may pass before an edge is given up as blocked; see `planning.edge_is_free`."""
+    num_shortcuts: int = 64
+    """Attempts to shorten a path."""
+    max_waypoints: int = 48
+    """Configurations of a path, at most."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "num_nodes", "max_iterations", "step", "resolution")
+        require(self, "num_shortcuts", self.num_shortcuts >= 0, "0 or more")
+        require(self, "max_waypoints", self.max_waypoints >= 3, "3 or more")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from vsearch_jax.config.parts import (
     EnvConfig,
     EvaluationConfig,
     IKConfig,
+    PlanningConfig,
     RandomSearchConfig,
     SACConfig,
     SceneConfig,
@@ -25,6 +26,7 @@ class Config:
 
     scene: SceneConfig = field(default_factory=SceneConfig)
     ik: IKConfig = field(default_factory=IKConfig)
+    planning: PlanningConfig = field(default_factory=PlanningConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
     random_search: RandomSearchConfig = field(default_factory=RandomSearchConfig)

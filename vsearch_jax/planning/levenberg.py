@@ -146,4 +146,5 @@ def _eliminate(index: Array, system: Array) -> Array:
 
 def _into(rotation: Array, vectors: Array) -> Array:
     """Returns `vectors` (f32[..., 3], world) in the frame that `rotation` (f32[3, 3]) turns into world."""
+    rotation = rotation.reshape((1,) * (vectors.ndim - 1) + rotation.shape)
     return jnp.sum(vectors[..., :, None] * rotation, axis=-2)
