@@ -15,6 +15,8 @@ from jax import Array
 
 # Lanes are refilled once this share of them has finished: refilling costs about as much as a few steps.
 REFILL_SHARE = 8
+# At the end this share of the lanes goes on alone.
+TAIL_SHARE = 8
 
 
 class Job(NamedTuple):
@@ -35,7 +37,7 @@ class Job(NamedTuple):
 
 
 class _Run(NamedTuple):
-    """Lanes with the problems they hold (index `size` where they idle), the queue's head, and the results so far."""
+    """Lanes with the problems they hold (its number N where they idle), the queue's head, and the results so far."""
 
     states: Any
     held: Array
@@ -53,41 +55,53 @@ def run(job: Job, problems: Any, order: tuple[Array, Array], states: Any, result
       states: pytree, leading axis L: the lanes; their content is overwritten.
       results: pytree, leading axis N, as `job.finish` returns them.
     """
-    size, num_lanes = order[0].shape[0], jax.tree.leaves(states)[0].shape[0]
-    queue, count = order
+    num_problems, num_lanes = order[0].shape[0], jax.tree.leaves(states)[0].shape[0]
+    state = _Run(states, jnp.full(num_lanes, num_problems, jnp.int32), jnp.int32(0), results)
+    # When the queue is empty and few are left, these go on alone: all lanes cost the same, idle or not.
+    few = num_lanes // TAIL_SHARE
+    state = _loop(job, problems, order, state, few)
+    if few:
+        busy = jnp.argsort(state.held >= num_problems)[:few]
+        state = state._replace(states=_rows(state.states, busy), held=state.held[busy])
+        state = _loop(job, problems, order, state, 0)
+    return state.results
 
-    def is_idle(held: Array) -> Array:
-        return held >= size
 
-    def refill(state: _Run) -> _Run:
-        rank = state.head + jnp.cumsum(is_idle(state.held)) - 1
-        is_new = is_idle(state.held) & (rank < count)
-        held = jnp.where(is_new, queue[jnp.clip(rank, 0, size - 1)], state.held)
-        states = jax.vmap(job.begin)(_rows(problems, held), state.states, is_new)
-        return state._replace(states=states, held=held, head=state.head + jnp.sum(is_new, dtype=jnp.int32))
-
-    def work(state: _Run) -> _Run:
-        state = refill(state)
-        current = _rows(problems, state.held)
-        num_held = jnp.sum(~is_idle(state.held))
-        # At the queue's end nobody can be refilled, so the lanes run on until all have finished.
-        enough = jnp.where(state.head < count, jnp.maximum(num_held // REFILL_SHARE, 1), num_held)
-
-        def goes_on(states: Any) -> Array:
-            return jnp.sum(jax.vmap(job.is_done)(states) & ~is_idle(state.held)) < enough
-
-        states = jax.lax.while_loop(goes_on, lambda states: jax.vmap(job.step)(current, states), state.states)
-        is_done = jax.vmap(job.is_done)(states) & ~is_idle(state.held)
-        row = jnp.where(is_done, state.held, size)
-        found = jax.vmap(job.finish)(current, states)
-        results = jax.tree.map(lambda old, new: old.at[row].set(new, mode="drop"), state.results, found)
-        return state._replace(states=states, held=jnp.where(is_done, size, state.held), results=results)
+def _loop(job: Job, problems: Any, order: tuple[Array, Array], state: _Run, few: int) -> _Run:
+    """Works until the queue is empty and no more than `few` lanes are busy."""
+    idle, count = order[0].shape[0], order[1]
 
     def is_open(state: _Run) -> Array:
-        return (state.head < count) | jnp.any(~is_idle(state.held))
+        return (state.head < count) | (jnp.sum(state.held < idle) > few)
 
-    start = _Run(states, jnp.full(num_lanes, size, jnp.int32), jnp.int32(0), results)
-    return jax.lax.while_loop(is_open, work, start).results
+    def work(state: _Run) -> _Run:
+        state = _refill(job, problems, order, state)
+        current, is_held = _rows(problems, state.held), state.held < idle
+        num_held = jnp.sum(is_held)
+        # At the queue's end nobody can be refilled.
+        enough = jnp.where(state.head < count, num_held // REFILL_SHARE, num_held - few)
+
+        def goes_on(states: Any) -> Array:
+            return jnp.sum(jax.vmap(job.is_done)(states) & is_held) < jnp.maximum(enough, 1)
+
+        states = jax.lax.while_loop(goes_on, lambda states: jax.vmap(job.step)(current, states), state.states)
+        is_done = jax.vmap(job.is_done)(states) & is_held
+        row = jnp.where(is_done, state.held, idle)
+        found = jax.vmap(job.finish)(current, states)
+        results = jax.tree.map(lambda old, new: old.at[row].set(new, mode="drop"), state.results, found)
+        return state._replace(states=states, held=jnp.where(is_done, idle, state.held), results=results)
+
+    return jax.lax.while_loop(is_open, work, state)
+
+
+def _refill(job: Job, problems: Any, order: tuple[Array, Array], state: _Run) -> _Run:
+    """Gives the next problems of the queue to idle lanes."""
+    (queue, count), idle = order, order[0].shape[0]
+    rank = state.head + jnp.cumsum(state.held >= idle) - 1
+    is_new = (state.held >= idle) & (rank < count)
+    held = jnp.where(is_new, queue[jnp.clip(rank, 0, idle - 1)], state.held)
+    states = jax.vmap(job.begin)(_rows(problems, held), state.states, is_new)
+    return state._replace(states=states, held=held, head=state.head + jnp.sum(is_new, dtype=jnp.int32))
 
 
 def in_order(is_wanted: Array) -> tuple[Array, Array]:

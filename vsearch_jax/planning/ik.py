@@ -104,20 +104,36 @@ def _solve_batch(config: IKConfig, arm: Arm, batch: tuple[Array, Array, Array]) 
     blank = _Solution(finite[:, address], jnp.zeros(count, bool), jnp.zeros(count, jnp.int32))
     found = _run(arm, config, problems, jnp.ones(count, bool), blank)
 
-    def clear(joints: Array, whole: Array) -> Array:
-        return is_free(arm, forward_kinematics(arm, whole.at[address].set(joints)))
-
     def retry(_: Array, state: tuple[_Solution, Array]) -> tuple[_Solution, Array]:
         best, is_clear = state
         is_open = best.is_solved & ~is_clear & (best.next_start < config.num_seeds)
         again = _run(arm, config, problems._replace(first_start=best.next_start), is_open, best)
-        is_better = is_open & again.is_solved & jax.vmap(clear)(again.joints, finite)
+        is_better = _clear(arm, again.joints, finite, is_open & again.is_solved)
         joints = jnp.where(is_better[:, None], again.joints, best.joints)
         return best._replace(joints=joints, next_start=again.next_start), is_clear | is_better
 
-    found, _ = jax.lax.fori_loop(0, NUM_RETRIES, retry, (found, jax.vmap(clear)(found.joints, finite)))
+    is_clear = _clear(arm, found.joints, finite, found.is_solved)
+    found, _ = jax.lax.fori_loop(0, NUM_RETRIES, retry, (found, is_clear))
     whole = finite.at[:, address].set(found.joints)
     return jax.vmap(functools.partial(judge, arm, config))(goal, whole, qpos)
+
+
+def _clear(arm: Arm, joints: Array, finite: Array, is_open: Array) -> Array:
+    """Returns bool[N]: without contact with the chain at `joints` (f32[N, J]); false where not `is_open`."""
+
+    def step(problem: tuple[Array, Array], _: Array) -> Array:
+        chain, whole = problem
+        free = is_free(arm, forward_kinematics(arm, whole.at[arm.chain.address].set(chain)))
+        return jnp.where(free, 1, 0)
+
+    job = lanes.Job(
+        begin=lambda _, state, is_new: jnp.where(is_new, -1, state),
+        step=step,
+        is_done=lambda state: state >= 0,
+        finish=lambda _, state: state > 0,
+    )
+    blank, states = jnp.zeros(is_open.shape, bool), jnp.zeros(min(MOST_LANES, is_open.shape[0]), jnp.int32)
+    return lanes.run(job, (joints, finite), lanes.in_order(is_open), states, blank)
 
 
 def _run(arm: Arm, config: IKConfig, problems: _Problem, is_open: Array, results: _Solution) -> _Solution:

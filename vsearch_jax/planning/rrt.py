@@ -19,7 +19,7 @@ from vsearch_jax.planning.trees import Problem
 from vsearch_jax.types import Path, PlanStatus
 
 # Lanes of a batch: enough for the vector units, few enough for the cache.
-MOST_LANES = 256
+MOST_LANES = 64
 
 
 def rrt_connect(arm: Arm, key: Array, start: Array, goal: Array, config: PlanningConfig) -> Path:
@@ -62,7 +62,8 @@ def _plan_batch(is_bidirectional: bool, config: PlanningConfig, arm: Arm, batch:
     finite = jnp.where(jnp.isfinite(starts), starts, arm.home[None])
     problems = Problem(finite[:, address], goals[:, address], finite, keys)
     goals = finite.at[:, address].set(problems.goal)
-    is_start_good, is_goal_good = (jax.vmap(functools.partial(_is_good, arm))(q) for q in (starts, goals))
+    ends = jnp.concatenate([starts, goals])
+    is_start_good, is_goal_good = jnp.split(jax.vmap(functools.partial(_is_good, arm))(ends), 2)
     is_sound = is_start_good & is_goal_good
 
     is_straight = _straight(arm, config, problems, is_sound)

@@ -16,6 +16,7 @@ from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, 
 SAMPLES_PER_STEP = 4
 # A shortcut must save this share of the path, else it is not worth its samples.
 LEAST_SAVING = 0.005
+NUM_CANDIDATES = 8
 
 
 class Crooked(NamedTuple):
@@ -81,26 +82,26 @@ def step(arm: Arm, config: PlanningConfig, problem: Crooked, state: Shortcut) ->
 
 
 def _propose(arm: Arm, problem: Crooked, state: Shortcut) -> Shortcut:
-    """Chooses two points of the path; an edge that is not worth trying is handed on as blocked."""
+    """Takes the shortcut that saves most of some random ones; one that is not worth trying counts as blocked."""
     lengths = jnp.linalg.norm(jnp.diff(state.waypoints, axis=0), axis=-1)
     ends = jnp.cumsum(lengths)
-    total = ends[-1]
     key = jax.random.fold_in(problem.key, state.attempts)
-    places = jnp.sort(jax.random.uniform(key, (2,))) * total
-    # Every other attempt starts at a waypoint: those are what a path has too many of.
-    corner = ends[jax.random.randint(key, (), 0, jnp.maximum(state.count - 2, 1))]
-    is_corner = state.attempts % 2 == 1
-    places = jnp.where(is_corner, jnp.sort(jnp.stack([corner, places[0]])), places)
-    segment = jnp.minimum(jnp.searchsorted(ends, places, side="left"), state.count - 2).astype(jnp.int32)
+    places = jax.random.uniform(key, (NUM_CANDIDATES, 2)) * ends[-1]
+    # Half of them start at a waypoint: those are what a path has too many of.
+    corners = ends[jax.random.randint(key, (NUM_CANDIDATES // 2,), 0, jnp.maximum(state.count - 2, 1))]
+    places = jnp.sort(places.at[: NUM_CANDIDATES // 2, 0].set(corners), axis=1)
+    segment = jnp.minimum(jnp.searchsorted(ends, places), state.count - 2).astype(jnp.int32)
     length = jnp.maximum(lengths[segment], 1e-9)
     share = jnp.clip((places - (ends[segment] - lengths[segment])) / length, 0.0, 1.0)
     below, above = state.waypoints[segment], state.waypoints[segment + 1]
-    start, end = below + share[:, None] * (above - below)
-    saving = places[1] - places[0] - jnp.linalg.norm(end - start)
-    fits = state.count + 2 - (segment[1] - segment[0]) <= state.waypoints.shape[0]
-    is_worth = (segment[1] > segment[0]) & (saving > LEAST_SAVING * total) & fits
-    edge = edge_between(arm, start, end)
-    return state._replace(edge=edge._replace(is_blocked=~is_worth), first=segment[0], last=segment[1] + 1)
+    points = below + share[..., None] * (above - below)
+    saving = places[:, 1] - places[:, 0] - jnp.linalg.norm(points[:, 1] - points[:, 0], axis=-1)
+    num_cut = segment[:, 1] - segment[:, 0]
+    fits = (num_cut > 0) & (state.count + 2 - num_cut <= state.waypoints.shape[0])
+    best = jnp.argmax(jnp.where(fits, saving, -jnp.inf))
+    is_worth = fits[best] & (saving[best] > LEAST_SAVING * ends[-1])
+    edge = edge_between(arm, points[best, 0], points[best, 1])
+    return state._replace(edge=edge._replace(is_blocked=~is_worth), first=segment[best, 0], last=segment[best, 1] + 1)
 
 
 def _cut(state: Shortcut) -> tuple[Array, Array]:
