@@ -40,6 +40,7 @@ class Arm:
       table_clearance: f32[] m, least distance from the table.
       data: mjx.Data into which `forward_kinematics` writes.
       camera_id: the wrist camera.
+      without_speed: names of the joints that move the camera and have no speed limit.
     """
 
     joints: Joints
@@ -59,6 +60,7 @@ class Arm:
     table_clearance: Array
     data: mjx.Data
     camera_id: int = flax.struct.field(pytree_node=False)
+    without_speed: tuple[str, ...] = flax.struct.field(pytree_node=False)
 
 
 @flax.struct.dataclass
@@ -120,6 +122,7 @@ def build_arm(scene: Scene) -> Arm:
         table_clearance=jnp.float32(scene.table_clearance),
         data=mjx.make_data(scene.mjx_model),
         camera_id=camera,
+        without_speed=tuple(model.joint(j).name for j in scene.joint_ids if np.isnan(speed[model.jnt_qposadr[j]])),
     )
 
 

@@ -165,6 +165,10 @@ def _load_arm(path: Path) -> mujoco.MjSpec:
             raise SceneError(
                 f"arm file {str(path)!r}: joint {joint.name!r} is free or a ball; make it hinges or take it out"
             )
+        joint.actgravcomp = True
+    # As the controllers of real arms do, the actuators carry the arm's weight by themselves.
+    for body in spec.bodies:
+        body.gravcomp = 1.0
     return spec
 
 

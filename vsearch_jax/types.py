@@ -107,6 +107,26 @@ class Path:
     status: Array
 
 
+class Trajectory(NamedTuple):
+    """A timed motion along a path with rounded corners; see `vsearch_jax.planning.time_path`. G grid intervals.
+
+    Attributes:
+      waypoints: f32[W, nq] rad or m, of the path.
+      radii: f32[W] rad, how far before and after each waypoint its bend begins and ends.
+      tangents: f32[W - 1, J], unit vectors along the straight pieces, of the joints that move the camera.
+      sizes: f32[G] rad, of the intervals along the path.
+      times: f32[G + 1] s, at their ends.
+      squared_speeds: f32[G + 1] rad^2/s^2, of the path there.
+    """
+
+    waypoints: Array
+    radii: Array
+    tangents: Array
+    sizes: Array
+    times: Array
+    squared_speeds: Array
+
+
 @flax.struct.dataclass
 class ReachabilityMap:
     """Which views of a grid the arm can reach, and with which joints.

@@ -94,7 +94,7 @@ class PlanningConfig:
     """Nodes of a tree, at most."""
     max_iterations: int = 2048
     """Edges that are tried for one problem, at most."""
-    step: float = 1.5
+    step: float = 3.0
     """Length in rad of a tree's random edges."""
     resolution: float = 0.004
     """How near in m the arm may pass before an edge is given up as blocked; see `planning.edge_is_free`."""
@@ -102,9 +102,14 @@ class PlanningConfig:
     """Attempts to shorten a path."""
     max_waypoints: int = 48
     """Configurations of a path, at most."""
+    acceleration_time: float = 0.5
+    """Seconds in which a joint can come to its full speed: what limits its acceleration."""
+    settling_time: float = 0.6
+    """Seconds that a dynamic arm is given at the end of a motion."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "num_nodes", "max_iterations", "step", "resolution")
+        require_positive(self, "num_nodes", "max_iterations", "step", "resolution", "acceleration_time")
+        require(self, "settling_time", self.settling_time >= 0.0, "0 or more")
         require(self, "num_shortcuts", self.num_shortcuts >= 0, "0 or more")
         require(self, "max_waypoints", self.max_waypoints >= 3, "3 or more")
 

@@ -5,8 +5,11 @@ from vsearch_jax.planning.ik import ik
 from vsearch_jax.planning.reachability import nearest_cell, reachability_map, solve_view
 from vsearch_jax.planning.rrt import rrt, rrt_connect
 from vsearch_jax.planning.starts import ik_from_starts, start_limits
+from vsearch_jax.planning.trajectory import PlanningError, duration, sample, time_path
 
 __all__ = [
+    "PlanningError",
+    "duration",
     "edge_is_free",
     "ik",
     "ik_from_starts",
@@ -14,6 +17,8 @@ __all__ = [
     "reachability_map",
     "rrt",
     "rrt_connect",
+    "sample",
     "solve_view",
     "start_limits",
+    "time_path",
 ]
