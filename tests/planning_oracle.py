@@ -1,5 +1,7 @@
 """What C MuJoCo says of joint paths: contact and the table's clearance, sampled densely."""
 
+import itertools
+
 import mujoco
 import numpy as np
 
@@ -37,7 +39,7 @@ class Oracle:
     def blocked(self, waypoints: np.ndarray, spacing: float = 0.01) -> int:
         """Returns how many samples of the path, `spacing` rad apart, are not free."""
         count = 0
-        for start, end in zip(waypoints, waypoints[1:], strict=False):
+        for start, end in itertools.pairwise(waypoints):
             steps = int(np.abs(end - start).max() / spacing) + 1
             if np.any(end != start):
                 count += sum(not self.is_free(start + u * (end - start)) for u in np.linspace(0, 1, steps + 1))

@@ -51,8 +51,7 @@ def execute(arm: Arm, model: mjx.Model, trajectory: Trajectory, config: Planning
 def _run(arm: Arm, model: mjx.Model, trajectory: Trajectory, settling_time: Array) -> Execution:
     gain, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
     lead = damping / jnp.maximum(gain, 1e-9)
-    joint = model.actuator_trnid[:, 0]
-    in_qpos, in_qvel = jnp.asarray(model.jnt_qposadr)[joint], jnp.asarray(model.jnt_dofadr)[joint]
+    in_qpos = jnp.asarray(model.jnt_qposadr)[jnp.asarray(model.actuator_trnid[:, 0])]
     total = duration(trajectory) + settling_time
 
     def step(state: tuple[mjx.Data, Array, Array]) -> tuple[mjx.Data, Array, Array]:

@@ -180,9 +180,17 @@ class EnvConfig:
     """Reward of the step that meets the threshold."""
     unreachable_reward: float = -2.0
     """Reward of a step to a view that the arm cannot reach; the arm stays."""
+    reachable: Literal["ik", "path"] = "ik"
+    """A view is reachable where joints for it are free, or where a free path from the present joints is found too."""
+    motion: Literal["kinematic", "dynamic"] = "kinematic"
+    """Joints are set, or driven along the path by the arm's dynamics; the picture is taken where the arm then is."""
 
     def __post_init__(self) -> None:
         require(self, "threshold", -1.0 < self.threshold < 1.0, "between -1 and 1")
+        require(self, "reachable", self.reachable in ("ik", "path"), "ik or path")
+        require(self, "motion", self.motion in ("kinematic", "dynamic"), "kinematic or dynamic")
+        allowed = "kinematic where reachable is 'ik': dynamics need a path"
+        require(self, "motion", self.reachable == "path" or self.motion == "kinematic", allowed)
         require(self, "action_scale_deg", 0.0 < self.action_scale_deg <= 180.0, "above 0, at most 180")
         require_positive(self, "episode_length")
         require_finite(self, "success_reward", "unreachable_reward")
