@@ -87,7 +87,8 @@ def build_scene(config: SceneConfig) -> Scene:
 
     Raises:
       SceneError: a name is unknown, a file is missing or cannot be loaded, the arm has no site `tcp`, no camera `wrist`
-        or no joint that moves the camera, has a joint that is neither a hinge nor a slide, or the object has no geom.
+        or no joint that moves the camera, has a joint that is neither a hinge nor a slide (a loose part's free joint
+        is dropped), or the object has no geom.
     """
     arm_path, object_path = _find("arm", config.arm), _find("object", config.object)
     arm, target = _load_arm(arm_path), _load_object(object_path)
@@ -160,16 +161,29 @@ def _load_arm(path: Path) -> mujoco.MjSpec:
             raise SceneError(
                 f"arm file {str(path)!r} has no {kind} named {name!r}; add one to the body that holds the tool"
             )
-    for joint in spec.joints:
-        if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+    moving = _bodies_above(spec, spec.camera(WRIST_CAMERA).parent)
+    for joint in list(spec.joints):
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE and joint.parent.id not in moving:
+            spec.delete(joint)  # a loose part: below the mount MuJoCo allows none, so it stands where the file has it
+        elif joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
             raise SceneError(
                 f"arm file {str(path)!r}: joint {joint.name!r} is free or a ball; make it hinges or take it out"
             )
-        joint.actgravcomp = True
+        else:
+            joint.actgravcomp = True
     # As the controllers of real arms do, the actuators carry the arm's weight by themselves.
     for body in spec.bodies:
         body.gravcomp = 1.0
     return spec
+
+
+def _bodies_above(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> set[int]:
+    """Returns the numbers of `body` and of those that it hangs on; `spec` has been compiled."""
+    numbers = set()
+    while body.id != spec.worldbody.id:
+        numbers.add(body.id)
+        body = body.parent
+    return numbers
 
 
 def _load_object(path: Path) -> mujoco.MjSpec:

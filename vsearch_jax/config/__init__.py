@@ -1,12 +1,11 @@
 """Frozen, hashable, validated configuration: jit's static argument, the command line and `config.json` in one."""
 
+from vsearch_jax.config.motion import IKConfig, PlanningConfig
 from vsearch_jax.config.parts import (
     CMAESConfig,
     EncoderConfig,
     EnvConfig,
     EvaluationConfig,
-    IKConfig,
-    PlanningConfig,
     RandomSearchConfig,
     SACConfig,
     SceneConfig,

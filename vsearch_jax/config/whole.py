@@ -6,13 +6,12 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
+from vsearch_jax.config.motion import IKConfig, PlanningConfig
 from vsearch_jax.config.parts import (
     CMAESConfig,
     EncoderConfig,
     EnvConfig,
     EvaluationConfig,
-    IKConfig,
-    PlanningConfig,
     RandomSearchConfig,
     SACConfig,
     SceneConfig,
