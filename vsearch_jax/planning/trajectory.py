@@ -83,7 +83,7 @@ def sample(arm: Arm, trajectory: Trajectory, time: Array) -> tuple[Array, Array]
     speed = jnp.sqrt(trajectory.squared_speeds[index])
     since = inside - times[index]
     share = jnp.clip((speed * since + 0.5 * push * since**2) / size, 0.0, 1.0)
-    piece, place = index // GRID, (index % GRID + share) / GRID
+    piece, place = index // GRID, ((index % GRID).astype(jnp.float32) + share) / GRID
     joints, tangent = _at(arm, trajectory, piece, place)
     is_moving = (time >= 0.0) & (time < times[-1])
     velocity = jnp.where(is_moving, tangent * jnp.maximum(speed + push * since, 0.0), 0.0)
@@ -124,6 +124,7 @@ def _limits(shape: Trajectory, lengths: Array, speed: Array, acceleration: Array
     G is `GRID` times the pieces: each straight one, and the bend after it (of no size after the last).
     """
     unit, radii = shape.tangents, shape.radii
+    speed, acceleration = (limit.reshape(1, 1, 1, -1) for limit in (speed, acceleration))
     following = jnp.concatenate([unit[1:], jnp.zeros((1, unit.shape[1]))])
     place = jnp.linspace(0.0, 1.0, GRID + 1)[None, :, None]
     turning = (1.0 - place) * unit[:, None] + place * following[:, None]
@@ -138,8 +139,8 @@ def _limits(shape: Trajectory, lengths: Array, speed: Array, acceleration: Array
     squared = jnp.minimum(squared, jnp.min(0.5 * acceleration / jnp.maximum(curvature, 1e-9), axis=-1))
     left = acceleration - curvature * squared[..., None]
     pushes = jnp.min(left / jnp.maximum(largest, 1e-9), axis=-1)
-    is_corner = (bend <= 0.0) & (lengths > 0.0) & (jnp.concatenate([lengths[1:], jnp.zeros(1)]) > 0.0)
-    must_stop = jnp.stack([jnp.zeros_like(is_corner), is_corner], axis=1)[:, :, None]
+    # Without a bend the direction jumps.
+    must_stop = jnp.stack([jnp.zeros_like(bend, bool), bend <= 0.0], axis=1)[:, :, None]
     inner = jnp.where(sizes > 0.0, squared, jnp.where(must_stop, 0.0, jnp.inf)).reshape(-1)
     caps = jnp.minimum(jnp.append(inner, 0.0), jnp.concatenate([jnp.zeros(1), inner]))
     return sizes.reshape(-1), caps, jnp.where(sizes > 0.0, pushes, 0.0).reshape(-1)
