@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +66,11 @@ def _errors(scene, qpos, poses) -> np.ndarray:
     return np.array(errors)
 
 
+@functools.cache
+def _solve_all_lwr(config):
+    return _solve_all(build_arm(build_scene(SceneConfig())), config)
+
+
 def _solve_all(arm, config):
     def pose(qpos):
         return camera_pose(arm, forward_kinematics(arm, qpos))
@@ -76,7 +82,7 @@ def _solve_all(arm, config):
 
 
 def test_ik_solves_poses_that_are_reachable_by_construction(scene, arm):
-    poses, present, result = _solve_all(arm, CONFIG)
+    poses, present, result = _solve_all_lwr(CONFIG)
     solved = np.asarray(result.is_converged)
     assert solved.mean() >= 0.995
     np.testing.assert_array_equal(np.asarray(result.status) == IKStatus.SOLVED, solved)
@@ -113,22 +119,22 @@ def test_ik_solves_six_axes():
 
 def test_the_redundancy_keeps_the_arm_near_and_off_its_limits(arm):
     def apart(config):
-        _, present, result = _solve_all(arm, config)
+        _, present, result = _solve_all_lwr(config)
         solved = np.asarray(result.is_converged)
         joints, lower, upper = (np.asarray(x)[..., :7] for x in (result.qpos, arm.lower, arm.upper))
         margin = np.minimum(joints - lower, upper - joints).min(axis=-1)
         return np.linalg.norm(result.qpos - present, axis=1)[solved].mean(), np.mean(margin[solved] < 1e-4)
 
     travel, at_limits = apart(dataclasses.replace(CONFIG, num_nullspace_steps=0))
-    less_travel, less_at_limits = apart(dataclasses.replace(CONFIG, num_nullspace_steps=8))
+    less_travel, less_at_limits = apart(CONFIG)
     assert less_travel < 0.97 * travel
     assert less_at_limits < 0.8 * at_limits
 
 
-def test_a_free_roll_asks_for_the_optical_axis_alone(scene, arm):
+def test_a_free_roll_asks_for_the_optical_axis_alone(scene):
     config = dataclasses.replace(CONFIG, is_roll_free=True)
-    poses, present, result = _solve_all(arm, config)
-    _, _, fixed = _solve_all(arm, CONFIG)
+    poses, present, result = _solve_all_lwr(config)
+    _, _, fixed = _solve_all_lwr(CONFIG)
     solved = np.asarray(result.is_converged)
     assert solved.mean() >= 0.995
     data, model = mujoco.MjData(scene.mj_model), scene.mj_model

@@ -17,7 +17,7 @@ from vsearch_jax.config import PlanningConfig, SceneConfig
 from vsearch_jax.planning import PlanningError, edge_is_free, rrt, rrt_connect, sample, start_limits, time_path
 from vsearch_jax.planning.edges import planning_gaps
 from vsearch_jax.scene import SceneError, build_scene
-from vsearch_jax.types import PlanStatus
+from vsearch_jax.types import Path, PlanStatus
 
 CONFIG = PlanningConfig()
 NUM_PROBLEMS = 64
@@ -38,11 +38,11 @@ class _Problems:
         self.start, self.goal = self.start[good], self.goal[good]
         self.keys = jax.random.split(jax.random.key(seed), len(self.start))
 
+        self.plan = jax.jit(jax.vmap(lambda k, a, b: rrt_connect(self.arm, k, a, b, CONFIG)))
+
     @functools.cached_property
     def paths(self):
-        return jax.jit(jax.vmap(lambda k, a, b: rrt_connect(self.arm, k, a, b, CONFIG)))(
-            self.keys, self.start, self.goal
-        )
+        return self.plan(self.keys, self.start, self.goal)
 
     @functools.cached_property
     def found(self):
@@ -71,11 +71,15 @@ def test_paths_are_free_and_join_start_and_goal(problems):
     _check_paths(problems)
 
 
-def test_uniform_tree_finds_free_paths_too(problems):
-    start, goal = problems.start[:16], problems.goal[:16]
-    paths = jax.jit(jax.vmap(lambda k, a, b: rrt(problems.arm, k, a, b, CONFIG)))(problems.keys[:16], start, goal)
+def test_a_uniform_tree_finds_free_paths_too_and_tells_a_spent_budget(problems):
+    config = dataclasses.replace(CONFIG, max_iterations=64)
+    paths = jax.jit(jax.vmap(lambda k, a, b: rrt(problems.arm, k, a, b, config)))(
+        problems.keys, problems.start, problems.goal
+    )
     found = np.asarray(paths.status) == PlanStatus.FOUND
-    assert found.mean() >= 0.8
+    assert found.mean() >= 0.6
+    assert np.all(np.asarray(paths.status)[~found] == PlanStatus.EXHAUSTED) and not np.all(found)
+    assert np.all(np.isinf(np.asarray(paths.length)[~found]))
     assert sum(problems.oracle.blocked(path) for path in np.asarray(paths.waypoints)[found]) == 0
 
 
@@ -116,26 +120,19 @@ def test_planning_pairs_never_claim_more_room_than_there_is(problems):
 
 
 def test_bad_ends_have_a_status(problems):
-    arm, start, goal = problems.arm, problems.start[0], problems.goal[0]
-    random = np.random.default_rng(0).uniform(*start_limits(arm), (200, 9)).astype(np.float32)
+    start, goal = problems.start[0], problems.goal[0]
+    random = np.random.default_rng(0).uniform(*start_limits(problems.arm), (200, 9)).astype(np.float32)
     folded = next(qpos for qpos in random if problems.oracle.look(qpos).ncon > 0)
     outside = goal.copy()
     outside[1] = 2.5
     nan = np.where(np.arange(9) == 3, np.nan, start).astype(np.float32)
     cases = [(folded, goal), (start, folded), (start, outside), (nan, goal), (start, nan), (outside, goal)]
-    starts, goals = (jnp.asarray(ends) for ends in zip(*cases, strict=True))
-    paths = jax.jit(jax.vmap(lambda a, b: rrt_connect(arm, jax.random.key(0), a, b, CONFIG)))(starts, goals)
+    starts, goals = problems.start.copy(), problems.goal.copy()  # as many as ever, which is compiled already
+    starts[:6], goals[:6] = (np.stack(ends) for ends in zip(*cases, strict=True))
+    paths = jax.tree.map(lambda leaf: leaf[:6], problems.plan(problems.keys, starts, goals))
     blocked = [PlanStatus.START_BLOCKED if i in (0, 3, 5) else PlanStatus.GOAL_BLOCKED for i in range(6)]
     np.testing.assert_array_equal(paths.status, blocked)
     assert np.all(np.isinf(paths.length)) and np.all(np.isfinite(paths.waypoints))
-
-
-def test_a_spent_budget_is_told(problems):
-    config = dataclasses.replace(CONFIG, max_iterations=1)
-    paths = jax.jit(jax.vmap(lambda k, a, b: rrt_connect(problems.arm, k, a, b, config)))(
-        problems.keys, problems.start, problems.goal
-    )
-    assert np.any(np.asarray(paths.status) == PlanStatus.EXHAUSTED)
 
 
 def _times(problems: _Problems, count: int = 400):
@@ -186,11 +183,9 @@ def test_missing_limits_are_named(tmp_path):
     path.write_text(MJCF)
     scene = build_scene(SceneConfig(arm=str(path), mount_height=1.0))
     arm = build_arm(scene)
-    start, _ = start_limits(arm)
-    plan = rrt_connect(arm, jax.random.key(0), arm.home, arm.home, CONFIG)
+    plan = Path(jnp.repeat(arm.home[None], 4, axis=0), jnp.float32(0.0), jnp.int32(PlanStatus.FOUND))
     with pytest.raises(PlanningError, match=r"no speed limit for joint arm/rail.*`user`"):
         time_path(arm, plan, CONFIG)
-    assert start.shape == (8,)
     path.write_text(MJCF.replace('name="elbow" axis="0 1 0" range="-2.4 2.4"', 'name="elbow" axis="0 1 0"'))
     with pytest.raises(SceneError, match=r"joint 'arm/elbow' has no limits"):
         build_arm(build_scene(SceneConfig(arm=str(path), mount_height=1.0)))
