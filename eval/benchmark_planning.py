@@ -203,9 +203,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--poses", type=int, default=2000)
     parser.add_argument("--problems", type=int, default=200)
+    parser.add_argument("--skip-ik", action="store_true")
     arguments = parser.parse_args()
     util.noOutputHandler()
-    benchmark_ik(arguments.poses)
+    if not arguments.skip_ik:
+        benchmark_ik(arguments.poses)
     benchmark_rrt(arguments.problems)
 
 

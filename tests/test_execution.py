@@ -76,7 +76,9 @@ def test_c_mujoco_follows_the_same_way_without_contact(moves):
     at = jax.jit(jax.vmap(lambda trajectory, t: sample(arm, trajectory, t), in_axes=(None, 0)))
     trajectory = jax.tree.map(lambda leaf: leaf[0], trajectories)
     count = round(float(done.time[0]) / model.opt.timestep)
-    joints, velocity = (np.asarray(x) for x in at(trajectory, jnp.arange(count) * model.opt.timestep))
+    joints, velocity = (
+        np.asarray(x) for x in at(trajectory, np.arange(count, dtype=np.float32) * np.float32(model.opt.timestep))
+    )
     lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0]
     data = mujoco.MjData(model)
     data.qpos[:] = paths.waypoints[0, 0]

@@ -158,8 +158,9 @@ def _check_motions(problems: _Problems) -> None:
         np.testing.assert_allclose(velocity[i, 0], 0.0, atol=1e-3)
         np.testing.assert_allclose(joints[i, 0], problems.start[i], atol=1e-5)
         np.testing.assert_allclose(joints[i, -1], problems.goal[i], atol=1e-4)
-        middle = 0.5 * (velocity[i, 1:] + velocity[i, :-1]) * step
-        np.testing.assert_allclose(np.diff(joints[i], axis=0), middle, atol=0.02 * step + 2e-5)
+        mean = 0.5 * (velocity[i, 1:] + velocity[i, :-1]) * step
+        slack = 0.25 * acceleration.max() * step**2 + 2e-5  # where the acceleration jumps between two samples
+        np.testing.assert_allclose(np.diff(joints[i], axis=0), mean, atol=slack)
         assert all(problems.oracle.is_free(q) for q in joints[i]), i
     assert np.all(np.isfinite(trajectory.times))
 

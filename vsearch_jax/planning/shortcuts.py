@@ -13,10 +13,11 @@ from vsearch_jax.arm import Arm
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, is_whole
 
-SAMPLES_PER_STEP = 4
+SAMPLES_PER_STEP = 2
 # A shortcut must save this share of the path, else it is not worth its samples.
-LEAST_SAVING = 0.005
-NUM_CANDIDATES = 8
+LEAST_SAVING = 0.002
+# More would choose bolder shortcuts, of which more are blocked.
+NUM_CANDIDATES = 4
 
 
 class Crooked(NamedTuple):

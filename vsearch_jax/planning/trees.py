@@ -16,8 +16,8 @@ from vsearch_jax.arm import Arm
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, is_whole, reached
 
-# Samples of an edge between two looks at the trees, which cost about as much as one sample.
-SAMPLES_PER_STEP = 4
+# Samples of an edge between two looks at the trees, which cost about half as much as one sample.
+SAMPLES_PER_STEP = 2
 # An edge that is blocked before this share of `config.step` adds no node.
 LEAST_PROGRESS = 0.05
 
