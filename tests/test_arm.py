@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from mujoco import mjx
 
 from second_arm import MJCF
-from vsearch_jax import collision
+from vsearch_jax import collision, shapes
 from vsearch_jax.arm import build_arm, camera_kinematics, camera_pose, clearance, forward_kinematics, is_free
 from vsearch_jax.config import SceneConfig
-from vsearch_jax.planning.ik import start_limits
+from vsearch_jax.planning.starts import start_limits
 from vsearch_jax.scene import build_scene
 
 FIELDS = (
@@ -161,20 +161,20 @@ def test_clearance_of_other_solids_is_on_the_safe_side(second):
 
 def test_a_missing_object_leaves_its_distance_infinite():
     setup = _Setup(SceneConfig())
-    pairs = collision.build_pairs(setup.scene.mj_model, setup.scene.arm_geom_ids, (), ())
-    _, target, own = collision.distances(
-        pairs, setup.fields["geom_xpos"][0], setup.fields["geom_xmat"][0], jnp.float32(0.0)
-    )
-    assert np.isinf(target) and np.isfinite(own)
+    geoms = collision.Geoms(setup.scene.arm_geom_ids, (), (), ())
+    pairs = collision.build_pairs(setup.scene.mj_model, setup.oracle(0), geoms, setup.scene.joint_ids, False)
+    gap = collision.gaps(pairs, setup.fields["geom_xpos"][0], setup.fields["geom_xmat"][0], jnp.float32(0.0))
+    assert np.isinf(collision.least(pairs, gap, collision.OBJECT))
+    assert np.isfinite(collision.least(pairs, gap, collision.SELF))
 
 
 _coordinate = st.floats(-0.5, 0.5, width=32)
 _point = st.tuples(_coordinate, _coordinate, _coordinate).map(lambda p: jnp.asarray(p, jnp.float32))
 _size = st.tuples(*[st.floats(0.01, 0.3)] * 3).map(lambda s: jnp.asarray(s, jnp.float32))
 _SOLIDS = {
-    "box": (mujoco.mjtGeom.mjGEOM_BOX, lambda p, s: collision.block_distance(p, s, jnp.asarray(False))),
-    "cylinder": (mujoco.mjtGeom.mjGEOM_CYLINDER, lambda p, s: collision.block_distance(p, s, jnp.asarray(True))),
-    "ellipsoid": (mujoco.mjtGeom.mjGEOM_ELLIPSOID, collision.ellipsoid_distance),
+    "box": (mujoco.mjtGeom.mjGEOM_BOX, lambda p, s: shapes.block_distance(p, s, jnp.asarray(False))),
+    "cylinder": (mujoco.mjtGeom.mjGEOM_CYLINDER, lambda p, s: shapes.block_distance(p, s, jnp.asarray(True))),
+    "ellipsoid": (mujoco.mjtGeom.mjGEOM_ELLIPSOID, shapes.ellipsoid_distance),
 }
 _PROBE = 1e-4
 
@@ -212,4 +212,4 @@ def test_distance_of_segments_is_the_least_over_both(a, u, b, v):
     assert sampled - spacing - 1e-4 <= ours <= sampled + 1e-4
 
 
-_segment_distance = jax.jit(collision.segment_distance)
+_segment_distance = jax.jit(shapes.segment_distance)

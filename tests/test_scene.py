@@ -86,7 +86,13 @@ def test_scene_knows_its_parts():
     assert model.site(scene.tcp_site_id).name == "arm/tcp"
     assert set(model.geom_bodyid[list(scene.arm_geom_ids)]) == set(_bodies_of(model, "arm/"))
     assert set(model.geom_bodyid[list(scene.object_geom_ids)]) == set(_bodies_of(model, "object/"))
-    ids = [*scene.arm_geom_ids, *scene.object_geom_ids, *scene.mount_geom_ids, scene.table_geom_id]
+    ids = [
+        *scene.arm_geom_ids,
+        *scene.object_geom_ids,
+        *scene.obstacle_geom_ids,
+        *scene.mount_geom_ids,
+        scene.table_geom_id,
+    ]
     assert sorted(ids) == list(range(model.ngeom))
     assert model.light("main").castshadow[0] and not model.light("fill").castshadow[0]
 
@@ -142,6 +148,26 @@ def test_another_arm_and_an_object_with_a_joint_fit_too(tmp_path):
     names = [scene.mj_model.joint(j).name.removeprefix("arm/") for j in scene.joint_ids]
     assert names == ["rail", "yaw", "pitch", "elbow", "roll", "tilt", "turn"]
     assert scene.mj_model.nq == 8
+
+
+def test_loose_parts_stand_still_and_coupled_joints_are_kept(tmp_path):
+    path = tmp_path / "arm.xml"
+    cup = '<body name="cup" pos="0.5 0.3 0.1"><freejoint name="loose"/><geom size="0.03"/></body></worldbody>'
+    coupling = '<equality><joint joint1="lever" joint2="elbow" polycoef="0 0.5 0 0 0"/></equality>'
+    path.write_text(MJCF.replace("</worldbody>", cup + coupling))
+    scene = build_scene(SceneConfig(arm=str(path)))
+    assert scene.mj_model.nq == 8 and scene.mj_model.neq == 1
+    assert scene.mj_model.body("arm/cup").jntnum == 0
+
+
+def test_obstacles_stand_where_their_file_has_them():
+    scene = build_scene(SceneConfig(obstacles="posts"))
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    assert len(scene.obstacle_geom_ids) == 5
+    np.testing.assert_allclose(data.geom("obstacle/shelf").xpos, [-0.5, 0, 0.45], atol=1e-9)
+    with pytest.raises(SceneError, match="unknown obstacles 'fence'; available: posts"):
+        build_scene(SceneConfig(obstacles="fence"))
 
 
 @pytest.mark.parametrize(
@@ -227,5 +253,5 @@ def test_a_bad_mesh_and_an_unknown_name_are_told(tmp_path):
         build_scene(SceneConfig(object=str(path)))
     with pytest.raises(SceneError, match="unknown object 'teepot'; available: bracket, teapot, truck"):
         build_scene(SceneConfig(object="teepot"))
-    with pytest.raises(SceneError, match="unknown arm 'kuka'; available: lwr"):
+    with pytest.raises(SceneError, match="unknown arm 'kuka'; available: lwr, ur5e"):
         build_scene(SceneConfig(arm="kuka"))

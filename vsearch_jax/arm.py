@@ -15,7 +15,7 @@ from mujoco import mjx
 
 from vsearch_jax import collision, kinematics
 from vsearch_jax.kinematics import Joints, Placement
-from vsearch_jax.scene import Scene
+from vsearch_jax.scene import Scene, SceneError
 
 
 @flax.struct.dataclass
@@ -33,11 +33,14 @@ class Arm:
       lower: f32[nq] rad or m, lower limits; -inf without one.
       upper: f32[nq] rad or m, upper limits; +inf without one.
       home: f32[nq] rad or m, middle of the limits.
+      speed: f32[nq] rad/s or m/s, speed limits; NaN where the model gives none (`user` of the joint).
       pairs: geometry that must not touch.
+      planning_pairs: those of them that planning must look at.
       table_height: f32[] m, world z of the table.
       table_clearance: f32[] m, least distance from the table.
       data: mjx.Data into which `forward_kinematics` writes.
       camera_id: the wrist camera.
+      without_speed: names of the joints that move the camera and have no speed limit.
     """
 
     joints: Joints
@@ -50,11 +53,14 @@ class Arm:
     lower: Array
     upper: Array
     home: Array
+    speed: Array
     pairs: collision.Pairs
+    planning_pairs: collision.Pairs
     table_height: Array
     table_clearance: Array
     data: mjx.Data
     camera_id: int = flax.struct.field(pytree_node=False)
+    without_speed: tuple[str, ...] = flax.struct.field(pytree_node=False)
 
 
 @flax.struct.dataclass
@@ -65,15 +71,21 @@ class Clearance:
       table: f32[], of the lowest point from the table.
       object: f32[], from the nearest geom of the object.
       self: f32[], between links that are not neighbours, and from the mount.
+      obstacles: f32[], from whatever else stands around.
     """
 
     table: Array
     object: Array
     self: Array
+    obstacles: Array
 
 
 def build_arm(scene: Scene) -> Arm:
-    """Returns the arm of `scene`."""
+    """Returns the arm of `scene`.
+
+    Raises:
+      SceneError: a joint that moves the camera has no limits.
+    """
     model = scene.mj_model
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
@@ -85,10 +97,11 @@ def build_arm(scene: Scene) -> Arm:
     chain = dataclasses.replace(
         jax.tree.map(lambda leaf: leaf[ids], joints), parent=jnp.arange(len(ids), dtype=jnp.int32)
     )
-    is_limited = model.jnt_limited.astype(bool)
-    lower = np.where(is_limited, model.jnt_range[:, 0], -np.inf)
-    upper = np.where(is_limited, model.jnt_range[:, 1], np.inf)
+    lower, upper, speed = _limits(scene)
+    is_limited, home = np.isfinite(lower), model.qpos0.copy()
+    home[is_limited] = 0.5 * (lower[is_limited] + upper[is_limited])
     camera = scene.camera_id
+    geoms = collision.Geoms(scene.arm_geom_ids, scene.mount_geom_ids, scene.object_geom_ids, scene.obstacle_geom_ids)
     return Arm(
         joints=joints,
         chain=chain,
@@ -101,13 +114,33 @@ def build_arm(scene: Scene) -> Arm:
         cameras=cameras,
         lower=jnp.asarray(lower, jnp.float32),
         upper=jnp.asarray(upper, jnp.float32),
-        home=jnp.asarray(np.where(is_limited, model.jnt_range.mean(axis=1), 0.0), jnp.float32),
-        pairs=collision.build_pairs(model, scene.arm_geom_ids, scene.mount_geom_ids, scene.object_geom_ids),
+        home=jnp.asarray(home, jnp.float32),
+        speed=jnp.asarray(speed, jnp.float32),
+        pairs=collision.build_pairs(model, data, geoms, scene.joint_ids, is_for_planning=False),
+        planning_pairs=collision.build_pairs(model, data, geoms, scene.joint_ids, is_for_planning=True),
         table_height=jnp.float32(scene.table_height),
         table_clearance=jnp.float32(scene.table_clearance),
         data=mjx.make_data(scene.mjx_model),
         camera_id=camera,
+        without_speed=tuple(model.joint(j).name for j in scene.joint_ids if np.isnan(speed[model.jnt_qposadr[j]])),
     )
+
+
+def _limits(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns lower and upper limits and speed limits, f64[nq] each; infinite or NaN where there are none."""
+    model = scene.mj_model
+    lower, upper, speed = (np.full(model.nq, value) for value in (-np.inf, np.inf, np.nan))
+    for joint in range(model.njnt):
+        address = model.jnt_qposadr[joint]
+        if model.jnt_limited[joint]:
+            lower[address], upper[address] = model.jnt_range[joint]
+        elif joint in scene.joint_ids:
+            raise SceneError(
+                f"joint {model.joint(joint).name!r} has no limits, so its values cannot be searched; give it a range"
+            )
+        if model.nuser_jnt and model.jnt_user[joint, 0] > 0:
+            speed[address] = model.jnt_user[joint, 0]
+    return lower, upper, speed
 
 
 def forward_kinematics(arm: Arm, qpos: Array) -> mjx.Data:
@@ -169,11 +202,14 @@ def clearance(arm: Arm, data: mjx.Data) -> Clearance:
     Geoms that are no capsules count as the capsule around them on the arm, and as the box around them where the object
     is a mesh; the distance is then on the safe side. Neighbours and excluded pairs are left out as MuJoCo does.
     """
-    table, target, own = collision.distances(arm.pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
-    return Clearance(table=table, object=target, self=own)
+    pairs = arm.pairs
+    gap = collision.gaps(pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
+    parts = (collision.TABLE, collision.OBJECT, collision.SELF, collision.OBSTACLE)
+    table, target, own, obstacles = (collision.least(pairs, gap, part) for part in parts)
+    return Clearance(table=table, object=target, self=own, obstacles=obstacles)
 
 
 def is_free(arm: Arm, data: mjx.Data) -> Array:
     """Returns bool[]: nothing touches, and the table's clearance is kept."""
-    distance = clearance(arm, data)
-    return (distance.table >= arm.table_clearance) & (distance.object > 0.0) & (distance.self > 0.0)
+    gap = collision.gaps(arm.pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
+    return jnp.all(gap > jnp.where(arm.pairs.part == collision.TABLE, arm.table_clearance, 0.0))

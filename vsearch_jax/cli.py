@@ -80,7 +80,23 @@ class Export:
     """Which of the run's policies."""
 
 
-Command = Train | Eval | Export
+@dataclasses.dataclass(frozen=True)
+class Reach:
+    """Draws which views an arm reaches, and proposes the mount height that best covers a wanted band."""
+
+    out: Path
+    """Folder of the pictures; it must not exist, or hold nothing."""
+    object: str = "teapot"
+    """A name (see xml/objects) or the path of a file."""
+    arm: str = "lwr"
+    """A name (see xml/arm) or the path of an MJCF file."""
+    band: tuple[float, float] = (40.0, 70.0)
+    """Lowest and highest elevation wanted, in degrees."""
+    heights: tuple[float, float, float] = (0.8, 1.6, 0.05)
+    """Lowest and highest mount height to try, and the step between, in m."""
+
+
+Command = Train | Eval | Export | Reach
 
 
 def parse(arguments: Sequence[str]) -> Command:
@@ -99,12 +115,16 @@ def parse(arguments: Sequence[str]) -> Command:
         Annotated[Train, tyro.conf.subcommand("train", default=train)],
         Annotated[Eval, tyro.conf.subcommand("eval")],
         Annotated[Export, tyro.conf.subcommand("export")],
+        Annotated[Reach, tyro.conf.subcommand("reach")],
     ]
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
             command = tyro.cli(
-                command_type, prog="vsearch", description="View search in JAX: train, evaluate, export.", args=arguments
+                command_type,
+                prog="vsearch",
+                description="View search in JAX: train, evaluate, export, reach.",
+                args=arguments,
             )
     except SystemExit as exit_:
         if not exit_.code:
@@ -213,6 +233,18 @@ def run_export(command: Export) -> None:
     print(f"wrote {command.out}: encoder.stablehlo, policy.stablehlo, interface.json")
 
 
+def run_reach(command: Reach) -> None:
+    """Runs `vsearch reach`."""
+    _import_runner()
+    from vsearch_jax.reach import draw_reach
+
+    scene = dataclasses.replace(Config().scene, arm=_absolute(command.arm), object=_absolute(command.object))
+    claim(command.out)
+    with Console().status("mapping what the arm reaches"):
+        message = draw_reach(command.out, scene, command.band, command.heights)
+    print(message)
+
+
 def _import_runner() -> Any:
     # mjx prints on import that Warp is missing, which nothing here needs.
     with contextlib.redirect_stdout(io.StringIO()):
@@ -227,7 +259,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command = None
     try:
         command = parse(sys.argv[1:] if arguments is None else arguments)
-        run = {Train: run_train, Eval: run_eval, Export: run_export}[type(command)]
+        run = {Train: run_train, Eval: run_eval, Export: run_export, Reach: run_reach}[type(command)]
         run(command)
     except KeyboardInterrupt:
         print(f"\nvsearch: {_interrupted(command)}", file=sys.stderr)

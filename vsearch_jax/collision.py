@@ -1,30 +1,27 @@
 """Signed distances between the arm's capsules and what they must not touch.
 
-Two capsules have a closed form (Ericson, Real-Time Collision Detection, 5.1.9). From a capsule to another convex solid
-the distance is that of the solid, minimised over the capsule's axis; it is convex there, so a golden section finds it.
+Two capsules have a closed form. From a capsule to another convex solid the distance is that of the solid, minimised
+over the capsule's axis; it is convex there, so a golden section finds it.
 """
 
 from __future__ import annotations
 
-import functools
-import math
-from collections.abc import Callable
+from typing import NamedTuple
 
 import flax.struct
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
 
-from vsearch_jax.kinematics import rotate
+from vsearch_jax import shapes
+from vsearch_jax.levers import extent_from_still_point, lever_arms
+from vsearch_jax.shapes import Vector
 
 GEOM = mujoco.mjtGeom
-GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
-# 0.618^14 = 1e-3 of the axis; near its minimum the distance changes by far less. The ends are looked at too.
-SEARCH_ITERATIONS = 14
-# Newton's steps from the left of a convex sum converge quadratically, and what is left shortens the distance.
-NEWTON_ITERATIONS = 4
+TABLE, OBJECT, SELF, OBSTACLE = range(4)
+# Planning leaves out pairs that never come nearer than this, in m: they cannot be the ones that stop it.
+NEVER_NEAR = 0.05
 
 
 @flax.struct.dataclass
@@ -37,7 +34,6 @@ class Solids:
       center: f32[N, 3] m, the solid's middle in the geom's frame.
       size: f32[N, 3] m: half sizes of a box, radii of an ellipsoid, radius and half length of a cylinder.
       is_cylinder: bool[N].
-      is_object: bool[N], the solid belongs to the object; else to the mount.
     """
 
     capsule: Array
@@ -45,12 +41,11 @@ class Solids:
     center: Array
     size: Array
     is_cylinder: Array
-    is_object: Array
 
 
 @flax.struct.dataclass
 class Pairs:
-    """What must not touch; C capsules, the arm's first, then spheres and capsules of mount and object.
+    """What must not touch; C capsules, N pairs in the order table, capsules, blocks, ellipsoids.
 
     Attributes:
       geom: i32[C], the geom of each capsule.
@@ -60,9 +55,10 @@ class Pairs:
       table: i32[M], capsules that must stay above the table.
       first: i32[P], one of each pair of capsules.
       second: i32[P], the other one.
-      is_object: bool[P], `second` belongs to the object.
       blocks: capsules against boxes and cylinders.
       ellipsoids: capsules against ellipsoids.
+      part: i32[N], what the arm would touch: TABLE, OBJECT, SELF (the mount included) or OBSTACLE.
+      levers: f32[N, J], most metres by which a unit of each joint of the chain shortens the distance.
     """
 
     geom: Array
@@ -72,55 +68,68 @@ class Pairs:
     table: Array
     first: Array
     second: Array
-    is_object: Array
     blocks: Solids
     ellipsoids: Solids
+    part: Array
+    levers: Array
+
+
+class Geoms(NamedTuple):
+    """Numbers of the geoms: of the arm, its mount, the object, and whatever else stands around."""
+
+    arm: tuple[int, ...]
+    mount: tuple[int, ...]
+    object: tuple[int, ...]
+    obstacles: tuple[int, ...]
 
 
 def build_pairs(
-    model: mujoco.MjModel, arm_geoms: tuple[int, ...], mount_geoms: tuple[int, ...], object_geoms: tuple[int, ...]
+    model: mujoco.MjModel, data: mujoco.MjData, geoms: Geoms, joints: tuple[int, ...], is_for_planning: bool
 ) -> Pairs:
     """Lists the pairs that can touch, by MuJoCo's rules: contact bits, weld groups, neighbours and excluded bodies.
 
     Args:
       model: the compiled scene.
-      arm_geoms: geoms of the arm.
-      mount_geoms: geoms of the mount.
-      object_geoms: geoms of the object.
+      data: its kinematics at `qpos0`.
+      geoms: which geom is what.
+      joints: the joints that planning moves.
+      is_for_planning: leave out pairs that never come near, and take ellipsoids for the capsules around them, which is
+        on the safe side.
     """
-    moving = [g for g in arm_geoms if model.body_weldid[model.geom_bodyid[g]] != 0]
-    round_kinds = (int(GEOM.mjGEOM_SPHERE), int(GEOM.mjGEOM_CAPSULE))
-    others = [*mount_geoms, *object_geoms]
-    capsules = [*arm_geoms, *(g for g in others if int(model.geom_type[g]) in round_kinds)]
+    pairs = [pair for pair in _touching(model, geoms) if not is_for_planning or _can_come_near(model, data, pair)]
+    as_capsules = {int(GEOM.mjGEOM_SPHERE), int(GEOM.mjGEOM_CAPSULE)}
+    as_capsules |= {int(GEOM.mjGEOM_ELLIPSOID)} if is_for_planning else set()
+    standing = (*geoms.mount, *geoms.object, *geoms.obstacles)
+    capsules = [*geoms.arm, *(g for g in standing if int(model.geom_type[g]) in as_capsules)]
     row = {g: i for i, g in enumerate(capsules)}
-    shapes = [_enclosing_capsule(model, g) for g in capsules]
-    round_pairs: list[tuple[int, int]] = []
-    solid_pairs: list[tuple[int, int]] = []
-    static = [g for g in arm_geoms if g not in moving]
-    for i, a in enumerate(moving):
-        for b in [*static, *moving[i + 1 :], *others]:
-            if _can_touch(model, a, b):
-                (round_pairs if b in row else solid_pairs).append((a, b))
-    is_ellipsoid = [int(model.geom_type[b]) == int(GEOM.mjGEOM_ELLIPSOID) for _, b in solid_pairs]
-    blocks = [pair for pair, is_smooth in zip(solid_pairs, is_ellipsoid, strict=True) if not is_smooth]
-    ellipsoids = [pair for pair, is_smooth in zip(solid_pairs, is_ellipsoid, strict=True) if is_smooth]
-    bits = model.geom_contype | model.geom_conaffinity
+    hulls = [_enclosing_capsule(model, g) for g in capsules]
+    round_pairs = [(a, b) for a, b in pairs if b in row]
+    solid_pairs = [(a, b) for a, b in pairs if b not in row]
+    is_smooth = [int(model.geom_type[b]) == int(GEOM.mjGEOM_ELLIPSOID) for _, b in solid_pairs]
+    blocks = [pair for pair, smooth in zip(solid_pairs, is_smooth, strict=True) if not smooth]
+    ellipsoids = [pair for pair, smooth in zip(solid_pairs, is_smooth, strict=True) if smooth]
+    table = [g for g in _moving(model, geoms) if _meets_table(model, g)]
+    if is_for_planning:
+        table = [g for g in table if _lowest(model, data, g) < NEVER_NEAR]
+    in_order = [*((g, None) for g in table), *round_pairs, *blocks, *ellipsoids]
+    arms = lever_arms(model, data, joints)
     return Pairs(
         geom=jnp.asarray(capsules, jnp.int32),
-        center=jnp.asarray([s[0] for s in shapes], jnp.float32),
-        half_axis=jnp.asarray([s[1] for s in shapes], jnp.float32),
-        radius=jnp.asarray([s[2] for s in shapes], jnp.float32),
-        table=jnp.asarray([row[g] for g in moving if bits[g]], jnp.int32),
+        center=jnp.asarray([hull[0] for hull in hulls], jnp.float32),
+        half_axis=jnp.asarray([hull[1] for hull in hulls], jnp.float32),
+        radius=jnp.asarray([hull[2] for hull in hulls], jnp.float32),
+        table=jnp.asarray([row[g] for g in table], jnp.int32),
         first=jnp.asarray([row[a] for a, _ in round_pairs], jnp.int32),
         second=jnp.asarray([row[b] for _, b in round_pairs], jnp.int32),
-        is_object=jnp.asarray([b in object_geoms for _, b in round_pairs], bool),
-        blocks=_solids(model, blocks, row, object_geoms),
-        ellipsoids=_solids(model, ellipsoids, row, object_geoms),
+        blocks=_solids(model, blocks, row),
+        ellipsoids=_solids(model, ellipsoids, row),
+        part=jnp.asarray([_part(geoms, b) for _, b in in_order], jnp.int32),
+        levers=jnp.asarray([_relative_levers(arms, a, b) for a, b in in_order], jnp.float32).reshape(-1, len(joints)),
     )
 
 
-def distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> tuple[Array, Array, Array]:
-    """Returns the signed distances f32[] in m from table, from object, and within the arm and from its mount.
+def gaps(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> Array:
+    """Returns the signed distance f32[N] in m of each pair.
 
     Args:
       pairs: what must not touch.
@@ -129,117 +138,86 @@ def distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Ar
       table_height: f32[] m, world z.
     """
     rotation = geom_xmat[pairs.geom]
-    center = geom_xpos[pairs.geom] + rotate(rotation, pairs.center)
-    half_axis = rotate(rotation, pairs.half_axis)
-    lowest = center[:, 2] - jnp.abs(half_axis[:, 2]) - pairs.radius
-    table = jnp.min(lowest[pairs.table] - table_height, initial=jnp.inf)
+    middle = shapes.turned(rotation, shapes.planes(pairs.center))
+    center = shapes.along(middle, jnp.ones_like(pairs.radius), shapes.planes(geom_xpos[pairs.geom]))
+    half_axis = shapes.turned(rotation, shapes.planes(pairs.half_axis))
+    lowest = center[2] - jnp.abs(half_axis[2]) - pairs.radius
     first, second = pairs.first, pairs.second
-    gap = jax.vmap(segment_distance)(center[first], half_axis[first], center[second], half_axis[second])
-    round_gap = gap - pairs.radius[first] - pairs.radius[second]
-    solids = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), pairs.blocks, pairs.ellipsoids)
-    rotation = geom_xmat[solids.geom]
-    local = _rotate_back(rotation, center[solids.capsule] - geom_xpos[solids.geom]) - solids.center
-    axis = _rotate_back(rotation, half_axis[solids.capsule])
-    solid_gap = _nearest_on_axis(solids, pairs.blocks.geom.shape[0], local, axis) - pairs.radius[solids.capsule]
-    gaps = jnp.concatenate([round_gap, solid_gap])
-    is_object = jnp.concatenate([pairs.is_object, solids.is_object])
-    target = jnp.min(jnp.where(is_object, gaps, jnp.inf), initial=jnp.inf)
-    own = jnp.min(jnp.where(is_object, jnp.inf, gaps), initial=jnp.inf)
-    return table, target, own
+    apart = shapes.segment_distance(*(_rows(v, i) for i in (first, second) for v in (center, half_axis)))
 
+    def solid(solids: Solids) -> tuple[Vector, Vector]:
+        turn = geom_xmat[solids.geom]
+        offset = shapes.minus(_rows(center, solids.capsule), shapes.planes(geom_xpos[solids.geom]))
+        local = shapes.minus(shapes.turned_back(turn, offset), shapes.planes(solids.center))
+        return local, shapes.turned_back(turn, _rows(half_axis, solids.capsule))
 
-def segment_distance(center_a: Array, half_a: Array, center_b: Array, half_b: Array) -> Array:
-    """Returns the distance f32[] in m of two segments, each given by its middle and half of itself (f32[3] m).
-
-    A segment may be a point; parallel segments are no exception (Ericson 5.1.9).
-    """
-    tiny = 1e-12
-    offset = center_a - center_b
-    aa, bb, ab = jnp.dot(half_a, half_a), jnp.dot(half_b, half_b), jnp.dot(half_a, half_b)
-    oa, ob = jnp.dot(half_a, offset), jnp.dot(half_b, offset)
-    determinant = aa * bb - ab * ab
-    is_skew = determinant > 1e-6 * aa * bb
-    s = jnp.where(is_skew, (ab * ob - bb * oa) / jnp.where(is_skew, determinant, 1.0), 0.0)
-    s = jnp.clip(s, -1.0, 1.0)
-    t = jnp.clip((ab * s + ob) / jnp.maximum(bb, tiny), -1.0, 1.0)
-    s = jnp.clip((ab * t - oa) / jnp.maximum(aa, tiny), -1.0, 1.0)
-    t = jnp.clip((ab * s + ob) / jnp.maximum(bb, tiny), -1.0, 1.0)
-    gap = offset + s * half_a - t * half_b
-    return jnp.sqrt(jnp.maximum(jnp.dot(gap, gap), 1e-24))
-
-
-def block_distance(point: Array, size: Array, is_cylinder: Array) -> Array:
-    """Returns the signed distance f32[] in m of a point from a box or a cylinder.
-
-    Args:
-      point: f32[3] m in the solid's frame.
-      size: f32[3] m: half sizes of a box; radius and half length of a cylinder about z.
-      is_cylinder: bool[].
-    """
-    box = jnp.abs(point) - size
-    # A cylinder is a rectangle in the half plane of the point; its third face is too deep to matter.
-    cylinder = jnp.stack([_norm(point[:2]) - size[0], jnp.abs(point[2]) - size[1], -jnp.inf])
-    outside = jnp.where(is_cylinder, cylinder, box)
-    return _norm(jnp.maximum(outside, 0.0)) + jnp.minimum(jnp.max(outside), 0.0)
-
-
-def ellipsoid_distance(point: Array, size: Array) -> Array:
-    """Returns the signed distance f32[] in m of `point` (f32[3]) from an ellipsoid of radii `size` (f32[3]).
-
-    The foot of the perpendicular is r^2 p / (t + r^2) with t the largest root of sum (r p / (t + r^2))^2 = 1 (Eberly,
-    Distance from a Point to an Ellipsoid). The sum is convex and falls, so Newton's steps from the left stay left.
-    """
-    p = jnp.maximum(jnp.abs(point), 1e-7)  # keeps the foot unique at the centre and in the planes of symmetry
-    squared = size * size
-    t = jnp.max(size * p - squared)
-    for _ in range(NEWTON_ITERATIONS):
-        ratio = size * p / (t + squared)
-        value = jnp.sum(ratio * ratio) - 1.0
-        slope = -2.0 * jnp.sum(ratio * ratio / (t + squared))
-        t = t - value / slope
-    foot = squared * p / (t + squared)
-    return jnp.sign(t) * _norm(p - foot)
-
-
-def _nearest_on_axis(solids: Solids, num_blocks: int, center: Array, half_axis: Array) -> Array:
-    """Golden section over the axes, f32[N, 3] in the solids' frames; returns the least distances seen, f32[N]."""
-    at = functools.partial(_distances_on_axis, solids, num_blocks, center, half_axis)
-    low = jnp.full(center.shape[0], -1.0)
-    high = -low
-    state = (
-        low,
-        high,
-        at(high - GOLDEN * (high - low)),
-        at(low + GOLDEN * (high - low)),
-        jnp.minimum(at(low), at(high)),
+    blocks, ellipsoids = pairs.blocks, pairs.ellipsoids
+    block_size, radii = shapes.planes(blocks.size), shapes.planes(ellipsoids.size)
+    from_blocks = shapes.least_along(
+        lambda point: shapes.block_distance(point, block_size, blocks.is_cylinder), *solid(blocks)
     )
-    *_, f_low, f_high, f_ends = jax.lax.fori_loop(0, SEARCH_ITERATIONS, functools.partial(_narrow, at), state)
-    return jnp.minimum(jnp.minimum(f_low, f_high), f_ends)
+    from_ellipsoids = shapes.least_along(lambda point: shapes.ellipsoid_distance(point, radii), *solid(ellipsoids))
+    return jnp.concatenate(
+        [
+            lowest[pairs.table] - table_height,
+            apart - pairs.radius[first] - pairs.radius[second],
+            from_blocks - pairs.radius[blocks.capsule],
+            from_ellipsoids - pairs.radius[ellipsoids.capsule],
+        ]
+    )
 
 
-def _distances_on_axis(solids: Solids, num_blocks: int, center: Array, half_axis: Array, s: Array) -> Array:
-    points = center + s[:, None] * half_axis
-    blocks = jax.vmap(block_distance)(points[:num_blocks], solids.size[:num_blocks], solids.is_cylinder[:num_blocks])
-    ellipsoids = jax.vmap(ellipsoid_distance)(points[num_blocks:], solids.size[num_blocks:])
-    return jnp.concatenate([blocks, ellipsoids])
+def least(pairs: Pairs, gap: Array, part: int) -> Array:
+    """Returns the least of the distances `gap` (f32[N]) from one part, f32[] m; +inf where there is nothing."""
+    return jnp.min(jnp.where(pairs.part == part, gap, jnp.inf), initial=jnp.inf)
 
 
-def _narrow(at: Callable[[Array], Array], _: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
-    low, high, f_low, f_high, f_ends = state  # f at low + (1 - GOLDEN) width and at low + GOLDEN width
-    is_left = f_low < f_high
-    width = high - low
-    low, high = jnp.where(is_left, low, high - GOLDEN * width), jnp.where(is_left, low + GOLDEN * width, high)
-    width = high - low
-    f_new = at(jnp.where(is_left, high - GOLDEN * width, low + GOLDEN * width))
-    return low, high, jnp.where(is_left, f_new, f_high), jnp.where(is_left, f_low, f_new), f_ends
+def _rows(vector: Vector, index: Array) -> Vector:
+    return vector[0][index], vector[1][index], vector[2][index]
 
 
-def _norm(vector: Array) -> Array:
-    return jnp.sqrt(jnp.maximum(jnp.sum(vector * vector, axis=-1), 1e-24))
+def _moving(model: mujoco.MjModel, geoms: Geoms) -> list[int]:
+    return [g for g in geoms.arm if model.body_weldid[model.geom_bodyid[g]] != 0]
 
 
-def _rotate_back(rotation: Array, vector: Array) -> Array:
-    return jnp.sum(rotation * vector[..., :, None], axis=-2)
+def _touching(model: mujoco.MjModel, geoms: Geoms) -> list[tuple[int, int]]:
+    """Returns pairs of a moving geom of the arm and another geom, each once."""
+    moving = _moving(model, geoms)
+    still = [*(g for g in geoms.arm if g not in moving), *geoms.mount, *geoms.object, *geoms.obstacles]
+    pairs = [(a, b) for i, a in enumerate(moving) for b in [*moving[i + 1 :], *still]]
+    return [(a, b) for a, b in pairs if _can_touch(model, a, b)]
+
+
+def _part(geoms: Geoms, other: int | None) -> int:
+    if other is None:
+        return TABLE
+    return OBJECT if other in geoms.object else OBSTACLE if other in geoms.obstacles else SELF
+
+
+def _relative_levers(arms: np.ndarray, a: int, b: int | None) -> np.ndarray:
+    """Joints that move both geoms leave their distance as it is."""
+    if b is None:
+        return arms[a]
+    return np.where((arms[a] > 0.0) & (arms[b] > 0.0), 0.0, arms[a] + arms[b])
+
+
+def _can_come_near(model: mujoco.MjModel, data: mujoco.MjData, pair: tuple[int, int]) -> bool:
+    moving, other = pair
+    if model.body_weldid[model.geom_bodyid[other]] != 0:
+        return True
+    point, extent = extent_from_still_point(model, data, moving)
+    away = float(np.linalg.norm(data.geom_xpos[other] - point)) - float(model.geom_rbound[other])
+    return away - extent < NEVER_NEAR
+
+
+def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Returns how near in m `geom` can come to the table, or less."""
+    point, extent = extent_from_still_point(model, data, geom)
+    return float(point[2]) - float(model.geom("table").pos[2]) - extent
+
+
+def _meets_table(model: mujoco.MjModel, geom: int) -> bool:
+    return bool(model.geom_contype[geom] | model.geom_conaffinity[geom])
 
 
 def _enclosing_capsule(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray, float]:
@@ -251,14 +229,17 @@ def _enclosing_capsule(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np
         return np.zeros(3), np.array([0.0, 0.0, size[1]]), float(size[0])
     center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
     longest = int(np.argmax(half))
+    others = np.delete(half, longest)
     half_axis = np.zeros(3)
+    if kind == int(GEOM.mjGEOM_ELLIPSOID):
+        # A ball of the middle radius at the end of this axis touches the tip from inside and holds the rest.
+        half_axis[longest] = half[longest] - others.max()
+        return center, half_axis, float(others.max())
     half_axis[longest] = half[longest]
-    return center, half_axis, float(np.hypot(*np.delete(half, longest)))
+    return center, half_axis, float(np.hypot(*others))
 
 
-def _solids(
-    model: mujoco.MjModel, pairs: list[tuple[int, int]], row: dict[int, int], object_geoms: tuple[int, ...]
-) -> Solids:
+def _solids(model: mujoco.MjModel, pairs: list[tuple[int, int]], row: dict[int, int]) -> Solids:
     geoms = np.array([b for _, b in pairs], dtype=np.int32)
     kinds = model.geom_type[geoms]
     is_exact = np.isin(kinds, (int(GEOM.mjGEOM_CYLINDER), int(GEOM.mjGEOM_ELLIPSOID)))[:, None]
@@ -269,7 +250,6 @@ def _solids(
         center=jnp.asarray(np.where(is_exact, 0.0, box[:, :3]), jnp.float32),
         size=jnp.asarray(np.where(is_exact, model.geom_size[geoms], box[:, 3:]), jnp.float32),
         is_cylinder=jnp.asarray(kinds == int(GEOM.mjGEOM_CYLINDER)),
-        is_object=jnp.asarray(np.isin(geoms, object_geoms)),
     )
 
 

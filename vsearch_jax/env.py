@@ -16,13 +16,17 @@ from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import Config, ConfigError
+from vsearch_jax.execution import execute
 from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
-from vsearch_jax.planning import nearest_cell, reachability_map, solve_view, start_limits
+from vsearch_jax.planning import nearest_cell, reachability_map, rrt_connect, solve_view, start_limits, time_path
 from vsearch_jax.scene import SceneError, build_scene
-from vsearch_jax.types import Camera, EncoderState, EpisodeState, Image, ReachabilityMap, Sight, View
+from vsearch_jax.types import Camera, EncoderState, EpisodeState, Image, PlanStatus, ReachabilityMap, Sight, View
 
 _REACH_SEED = 20_191_201
 """Of the starts from which the reachability map is solved: the same map in every run, whatever the run's seed."""
+
+_PLANNING_SEED = 20_191_202
+"""Of the random trees: the same path between the same joints, always."""
 
 
 class ViewSearchEnv(Env):
@@ -175,7 +179,24 @@ class ViewSearchEnv(Env):
     def look(self, view: View, qpos: Array) -> tuple[Sight, Array]:
         """Returns what is seen from `view` when the arm comes from joints `qpos` (f32[nq]), and bool[] is_reachable."""
         joints, is_reachable = self.solve(view, qpos)
+        if self.config.env.reachable == "path":
+            joints, is_joined = self.move(qpos, joints)
+            is_reachable = is_reachable & is_joined
         return self.see(view, joints), is_reachable
+
+    def move(self, qpos: Array, goal: Array) -> tuple[Array, Array]:
+        """Returns where the arm stands after it was to go from `qpos` to `goal` (f32[nq] each), and bool[] path found.
+
+        Without a path it stays. In dynamic motion it follows the path and ends where its dynamics lead.
+        """
+        path = rrt_connect(self.arm, jax.random.key(_PLANNING_SEED), qpos, goal, self.config.planning)
+        is_found = path.status == int(PlanStatus.FOUND)
+        if self.config.env.motion == "kinematic":
+            return path.waypoints[-1], is_found
+        trajectory = time_path(self.arm, path, self.config.planning)
+        reached = execute(self.arm, self.scene.mjx_model, trajectory, self.config.planning).qpos
+        # The limits are soft constraints: the next plan must be able to start from here.
+        return jnp.clip(reached, self.arm.lower, self.arm.upper), is_found
 
     def see(self, view: View, qpos: Array) -> Sight:
         """Returns what the wrist camera sees with the arm at joints `qpos` (f32[nq]); `view` is only noted."""
@@ -209,7 +230,8 @@ def check_band(reach: ReachabilityMap, config: Config) -> None:
     if not isinstance(reach.band, Tracer) and np.isnan(reach.band).any():
         raise ConfigError(
             f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
-            f"at every azimuth around object {config.scene.object!r}; try another mount_height or radius"
+            f"at every azimuth around object {config.scene.object!r}; `vsearch reach` draws what it does reach, and "
+            "proposes a mount_height"
         )
 
 

@@ -17,6 +17,7 @@ from vsearch_jax.meshes import MESH_SUFFIXES, MeshError, check, is_read_by_mujoc
 
 ARM_PREFIX = "arm/"
 OBJECT_PREFIX = "object/"
+OBSTACLE_PREFIX = "obstacle/"
 TCP_SITE = "tcp"
 WRIST_CAMERA = "wrist"
 
@@ -45,6 +46,7 @@ class Scene:
       arm_geom_ids: geoms of the arm, its fixed base included.
       mount_geom_ids: geoms of the mount.
       object_geom_ids: geoms of the object.
+      obstacle_geom_ids: geoms of whatever else stands around.
       table_geom_id: the table plane.
     """
 
@@ -61,6 +63,7 @@ class Scene:
     arm_geom_ids: tuple[int, ...]
     mount_geom_ids: tuple[int, ...]
     object_geom_ids: tuple[int, ...]
+    obstacle_geom_ids: tuple[int, ...]
     table_geom_id: int
 
 
@@ -71,7 +74,7 @@ def xml_folder() -> Path:
 
 
 def available(kind: str) -> tuple[str, ...]:
-    """Returns the names of the arms (`kind` "arm") or objects ("objects") that come with the package."""
+    """Returns the names of what comes with the package: `kind` is "arm", "objects" or "obstacles"."""
     return tuple(sorted(path.stem for path in (xml_folder() / kind).glob("*.xml")))
 
 
@@ -83,12 +86,12 @@ def build_scene(config: SceneConfig) -> Scene:
     point on the table and the middle of its bounding box over the origin; holes and faces without area are logged.
 
     Args:
-      config: names or paths of arm and object, mount height and view sphere.
+      config: names or paths of arm, object and obstacles, mount height and view sphere.
 
     Raises:
       SceneError: a name is unknown, a file is missing or cannot be loaded, the arm has no site `tcp`, no camera `wrist`
-        or no joint that moves the camera, has a joint that is neither a hinge nor a slide, the object has no geom, or
-        it is a mesh too large or too small to be looked at.
+        or no joint that moves the camera, has a joint that is neither a hinge nor a slide (a loose part's free joint
+        is dropped), the object has no geom, or it is a mesh too large or too small to be looked at.
     """
     arm_path, object_path = _find("arm", config.arm), _find("object", config.object)
     arm, target = _load_arm(arm_path), _load_object(object_path, config.radius)
@@ -97,6 +100,9 @@ def build_scene(config: SceneConfig) -> Scene:
     mount.pos = [0.0, 0.0, config.mount_height]
     _attach(spec, arm, mount, ARM_PREFIX)
     _attach(spec, target, spec.body("object"), OBJECT_PREFIX)
+    if config.obstacles is not None:
+        still = _load_still("obstacles", _find("obstacles", config.obstacles))
+        _attach(spec, still, spec.body("obstacles"), OBSTACLE_PREFIX)
     try:
         model = spec.compile()
     except ValueError as error:
@@ -120,12 +126,13 @@ def build_scene(config: SceneConfig) -> Scene:
         arm_geom_ids=tuple(g for g in _geoms_below(model, mount_id) if model.geom_bodyid[g] != mount_id),
         mount_geom_ids=tuple(np.flatnonzero(model.geom_bodyid == mount_id).tolist()),
         object_geom_ids=_geoms_below(model, object_id),
+        obstacle_geom_ids=_geoms_below(model, model.body("obstacles").id),
         table_geom_id=model.geom("table").id,
     )
 
 
 def _find(part: str, name: str) -> Path:
-    folder = "arm" if part == "arm" else "objects"
+    folder = "objects" if part == "object" else part
     path = Path(name).expanduser()
     if path.suffix or path.parent != Path("."):
         if not path.is_file():
@@ -157,12 +164,29 @@ def _load_arm(path: Path) -> mujoco.MjSpec:
             raise SceneError(
                 f"arm file {str(path)!r} has no {kind} named {name!r}; add one to the body that holds the tool"
             )
-    for joint in spec.joints:
-        if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+    moving = _bodies_above(spec, spec.camera(WRIST_CAMERA).parent)
+    for joint in list(spec.joints):
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE and joint.parent.id not in moving:
+            spec.delete(joint)  # a loose part: below the mount MuJoCo allows none, so it stands where the file has it
+        elif joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
             raise SceneError(
                 f"arm file {str(path)!r}: joint {joint.name!r} is free or a ball; make it hinges or take it out"
             )
+        else:
+            joint.actgravcomp = True
+    # As the controllers of real arms do, the actuators carry the arm's weight by themselves.
+    for body in spec.bodies:
+        body.gravcomp = 1.0
     return spec
+
+
+def _bodies_above(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> set[int]:
+    """Returns the numbers of `body` and of those that it hangs on; `spec` has been compiled."""
+    numbers = set()
+    while body.id != spec.worldbody.id:
+        numbers.add(body.id)
+        body = body.parent
+    return numbers
 
 
 def _load_object(path: Path, largest: float) -> mujoco.MjSpec:
@@ -171,11 +195,16 @@ def _load_object(path: Path, largest: float) -> mujoco.MjSpec:
             return _load_mesh(path, largest)
         except (MeshError, ValueError) as error:
             raise SceneError(f"object file {str(path)!r} cannot be loaded: {_one_line(error)}") from error
-    spec = _load("object", path)
-    for joint in list(spec.joints):
-        spec.delete(joint)
+    spec = _load_still("object", path)
     if not spec.geoms:
         raise SceneError(f"object file {str(path)!r} has no geom; there is nothing to look at")
+    return spec
+
+
+def _load_still(part: str, path: Path) -> mujoco.MjSpec:
+    spec = _load(part, path)
+    for joint in list(spec.joints):
+        spec.delete(joint)
     return spec
 
 

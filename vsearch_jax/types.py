@@ -6,6 +6,7 @@ Frames: `world` is MuJoCo's world frame (z up); a camera looks along its own -z 
 
 from __future__ import annotations
 
+import enum
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -61,6 +62,14 @@ class Image:
     normal: Array | None = None
 
 
+class IKStatus(enum.IntEnum):
+    """How an inverse-kinematics problem ended: solved, no start led there, or pose or joints were NaN or infinite."""
+
+    SOLVED = 0
+    UNREACHABLE = 1
+    NOT_FINITE = 2
+
+
 @flax.struct.dataclass
 class IKResult:
     """The outcome of one inverse-kinematics problem.
@@ -68,14 +77,60 @@ class IKResult:
     Attributes:
       qpos: f32[nq] rad or m; inside the joint limits.
       position_error: f32[] m.
-      rotation_error: f32[] rad, geodesic.
+      rotation_error: f32[] rad, geodesic; with a free roll, of the optical axis.
       is_converged: bool[], both errors are within the tolerances of the config.
+      status: i32[], an IKStatus.
     """
 
     qpos: Array
     position_error: Array
     rotation_error: Array
     is_converged: Array
+    status: Array
+
+
+class PlanStatus(enum.IntEnum):
+    """How a planning problem ended; see `vsearch_jax.planning.rrt_connect`."""
+
+    FOUND = 0
+    EXHAUSTED = 1
+    START_BLOCKED = 2
+    GOAL_BLOCKED = 3
+
+
+@flax.struct.dataclass
+class Path:
+    """A joint path of straight pieces.
+
+    Attributes:
+      waypoints: f32[W, nq] rad or m, from start to goal; the goal repeats to the end. All are the start without a path.
+      length: f32[] rad (or m), sum of the Euclidean lengths in joint space; +inf without a path.
+      status: i32[], a PlanStatus.
+    """
+
+    waypoints: Array
+    length: Array
+    status: Array
+
+
+class Trajectory(NamedTuple):
+    """A timed motion along a path with rounded corners; see `vsearch_jax.planning.time_path`. G grid intervals.
+
+    Attributes:
+      waypoints: f32[W, nq] rad or m, of the path.
+      radii: f32[W] rad, how far before and after each waypoint its bend begins and ends.
+      tangents: f32[W - 1, J], unit vectors along the straight pieces, of the joints that move the camera.
+      sizes: f32[G] rad, of the intervals along the path.
+      times: f32[G + 1] s, at their ends.
+      squared_speeds: f32[G + 1] rad^2/s^2, of the path there.
+    """
+
+    waypoints: Array
+    radii: Array
+    tangents: Array
+    sizes: Array
+    times: Array
+    squared_speeds: Array
 
 
 @flax.struct.dataclass

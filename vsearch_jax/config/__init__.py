@@ -1,11 +1,11 @@
 """Frozen, hashable, validated configuration: jit's static argument, the command line and `config.json` in one."""
 
+from vsearch_jax.config.motion import IKConfig, PlanningConfig
 from vsearch_jax.config.parts import (
     CMAESConfig,
     EncoderConfig,
     EnvConfig,
     EvaluationConfig,
-    IKConfig,
     RandomSearchConfig,
     SACConfig,
     SceneConfig,
@@ -22,6 +22,7 @@ __all__ = [
     "EnvConfig",
     "EvaluationConfig",
     "IKConfig",
+    "PlanningConfig",
     "RandomSearchConfig",
     "SACConfig",
     "SceneConfig",

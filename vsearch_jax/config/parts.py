@@ -16,6 +16,8 @@ class SceneConfig:
     """A name in xml/arm, or the path of an MJCF file with a site `tcp` and a camera `wrist`."""
     object: str = "teapot"
     """A name in xml/objects, or the path of an MJCF file with one body of primitive geoms."""
+    obstacles: str | None = None
+    """What else stands around: a name in xml/obstacles, or the path of an MJCF file in world coordinates."""
     mount_height: float = 1.355
     """Height in m of the arm's base above the table; the arm hangs from it."""
     radius: float = 0.35
@@ -33,44 +35,6 @@ class SceneConfig:
         require(self, "center_height", self.center_height >= 0.0, "0 or more")
         require(self, "table_clearance", self.table_clearance >= 0.0, "0 or more")
         require(self, "image_size", self.image_size % 16 == 0, "a multiple of 16")
-
-
-@dataclass(frozen=True)
-class IKConfig:
-    """Levenberg-Marquardt inverse kinematics and the reachability map that feeds it starts."""
-
-    num_seeds: int = 16
-    """Starts of `ik`: the present joints and others spread over the limits."""
-    num_iterations: int = 16
-    """Iterations from each start."""
-    damping: float = 1e-3
-    """Initial damping of the normal equations."""
-    position_tolerance: float = 1e-3
-    """Converged below this error in m."""
-    rotation_tolerance_deg: float = 0.5
-    """Converged below this error in degrees."""
-    map_azimuths: int = 72
-    """Cells of the reachability map around the object."""
-    map_elevations: int = 19
-    """Cells of the reachability map from the table plane to the pole."""
-    map_seeds: int = 24
-    """Random starts for each cell of the map."""
-    map_iterations: int = 40
-    """Iterations from each start of the map."""
-
-    def __post_init__(self) -> None:
-        require_positive(
-            self,
-            "num_seeds",
-            "num_iterations",
-            "damping",
-            "position_tolerance",
-            "rotation_tolerance_deg",
-            "map_azimuths",
-            "map_seeds",
-            "map_iterations",
-        )
-        require(self, "map_elevations", self.map_elevations >= 2, "2 or more")
 
 
 @dataclass(frozen=True)
@@ -139,9 +103,17 @@ class EnvConfig:
     """Reward of the step that meets the threshold."""
     unreachable_reward: float = -2.0
     """Reward of a step to a view that the arm cannot reach; the arm stays."""
+    reachable: Literal["ik", "path"] = "ik"
+    """A view is reachable where joints for it are free, or where a free path from the present joints is found too."""
+    motion: Literal["kinematic", "dynamic"] = "kinematic"
+    """Joints are set, or driven along the path by the arm's dynamics; the picture is taken where the arm then is."""
 
     def __post_init__(self) -> None:
         require(self, "threshold", -1.0 < self.threshold < 1.0, "between -1 and 1")
+        require(self, "reachable", self.reachable in ("ik", "path"), "ik or path")
+        require(self, "motion", self.motion in ("kinematic", "dynamic"), "kinematic or dynamic")
+        allowed = "kinematic where reachable is 'ik': dynamics need a path"
+        require(self, "motion", self.reachable == "path" or self.motion == "kinematic", allowed)
         require(self, "action_scale_deg", 0.0 < self.action_scale_deg <= 180.0, "above 0, at most 180")
         require_positive(self, "episode_length")
         require_finite(self, "success_reward", "unreachable_reward")

@@ -6,12 +6,12 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
+from vsearch_jax.config.motion import IKConfig, PlanningConfig
 from vsearch_jax.config.parts import (
     CMAESConfig,
     EncoderConfig,
     EnvConfig,
     EvaluationConfig,
-    IKConfig,
     RandomSearchConfig,
     SACConfig,
     SceneConfig,
@@ -25,6 +25,7 @@ class Config:
 
     scene: SceneConfig = field(default_factory=SceneConfig)
     ik: IKConfig = field(default_factory=IKConfig)
+    planning: PlanningConfig = field(default_factory=PlanningConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
     random_search: RandomSearchConfig = field(default_factory=RandomSearchConfig)

@@ -1,4 +1,4 @@
-"""Inverse kinematics by Levenberg-Marquardt inside the joint limits, from several starts at once."""
+"""Inverse kinematics by Levenberg-Marquardt inside the joint limits, from several starts."""
 
 from __future__ import annotations
 
@@ -7,176 +7,227 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jaxlie import SE3, SO3
+from jaxlie import SE3
 
-from vsearch_jax.arm import Arm, camera_kinematics, forward_kinematics, is_free
+from vsearch_jax import lanes
+from vsearch_jax.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.config import IKConfig
-from vsearch_jax.geometry import rotation_error
+from vsearch_jax.planning import levenberg
+from vsearch_jax.planning.levenberg import Goal, Iterate
+from vsearch_jax.planning.starts import finite_joints, judge
 from vsearch_jax.types import IKResult
 
-# Metres that one radian weighs in the cost: about the lever of a wrist.
-ROTATION_WEIGHT = 0.3
-# Longest step of a joint, in rad or m: the linear model holds no farther.
-MAX_STEP = 0.8
-DAMPING_FALL, DAMPING_RISE = 0.2, 5.0
-DAMPING_RANGE = (1e-7, 1e2)
+# Lanes of a batch: enough for the vector units, few enough for the cache.
+MOST_LANES = 256
+# How often a solution in contact is put aside for one from later starts.
+NUM_RETRIES = 2
+# The preference: half the squared way from the present joints, and this much for each joint at its limit, which counts
+# from the last tenth of the range on.
+LIMIT_WEIGHT, LIMIT_SHARE = 0.05, 0.1
+# Share of the preference's slope that a step follows, and its longest step of a joint, in rad or m.
+PREFERENCE_RATE, PREFERENCE_STEP = 0.5, 0.25
 
 
-class _Iterate(NamedTuple):
-    """Joints f32[J] with cost f32[], weighted error f32[6], weighted Jacobian f32[6, J] and damping f32[]."""
+class _Problem(NamedTuple):
+    """A goal, the present joints f32[J] (of the chain, finite) and the first start that is tried, i32[]."""
 
+    goal: Goal
+    present: Array
+    first_start: Array
+
+
+class _State(NamedTuple):
+    """A lane.
+
+    Attributes:
+      iterate: of the present start; once it has converged, where the nullspace has taken it.
+      start: i32[], which start it came from.
+      iterations: i32[], done from this start.
+      polish: i32[], nullspace steps done; -1 before convergence.
+      joints: f32[J], the best found so far.
+      cost: f32[], their cost; while nothing has converged.
+      preference: f32[], their preference; +inf while nothing has converged.
+      is_done: bool[].
+    """
+
+    iterate: Iterate
+    start: Array
+    iterations: Array
+    polish: Array
     joints: Array
     cost: Array
-    error: Array
-    jacobian: Array
-    damping: Array
+    preference: Array
+    is_done: Array
+
+
+class _Solution(NamedTuple):
+    """Joints f32[J], whether they solve the problem, bool[], and the start after the last one used, i32[]."""
+
+    joints: Array
+    is_solved: Array
+    next_start: Array
 
 
 def ik(arm: Arm, T_world_camera: SE3, qpos: Array, config: IKConfig) -> IKResult:
     """Returns joints that bring the wrist camera to `T_world_camera`.
 
-    Starts are the present joints and `config.num_seeds - 1` others, spread evenly over the limits. Of the solutions the
-    nearest to the present joints is returned, one without contact before one with; without any, the closest try.
-    Joints that do not move the camera (fingers) stay.
+    The starts are the present joints, then `config.num_seeds - 1` others spread evenly over the limits. From the first
+    that converges the arm's redundancy is used to come near the present joints and away from the limits. A solution in
+    contact gives way to one without, if the next starts find one. Without any solution the closest try is returned.
+    Joints that do not move the camera (fingers, loose parts) stay.
+
+    Under `vmap` the problems share a fixed number of lanes (see `vsearch_jax.lanes`), so that none waits for the
+    slowest; the arm cannot be mapped over.
 
     Args:
       arm: the arm.
       T_world_camera: the pose wanted, in world.
-      qpos: f32[nq] rad or m, the present joints. Values that are not finite count as the middle of the limits.
-      config: iterations, damping, tolerances and number of starts.
+      qpos: f32[nq] rad or m, the present joints. Values that are not finite are solved for from the middle of the
+        limits, but the status says so and the result does not count as converged.
+      config: iterations, damping, tolerances, number of starts, and whether the camera may roll.
     """
-    spread = spread_starts(arm, config.num_seeds - 1)
-    starts = jnp.concatenate([qpos[None], spread])
-    return ik_from_starts(arm, T_world_camera, starts, qpos, config)[0]
+    solve = lanes.flattened(functools.partial(_solve_batch, config))
+    poses = (T_world_camera.translation()[None], T_world_camera.rotation().as_matrix()[None])
+    result = solve(arm, (*poses, qpos[None]))
+    return jax.tree.map(lambda leaf: leaf[0], result)
 
 
-def ik_from_starts(
-    arm: Arm,
-    T_world_camera: SE3,
-    starts: Array,
-    qpos: Array,
-    config: IKConfig,
-) -> tuple[IKResult, Array]:
-    """Solves from every start and returns the valid solution nearest to the present joints.
+def _solve_batch(config: IKConfig, arm: Arm, batch: tuple[Array, Array, Array]) -> IKResult:
+    positions, rotations, qpos = batch
+    count, address = qpos.shape[0], arm.chain.address
+    finite = jax.vmap(functools.partial(finite_joints, arm))(qpos)
+    limits = [jnp.broadcast_to(limit[address][None], (count, len(address))) for limit in (arm.lower, arm.upper)]
+    goal = Goal(positions, rotations, *limits)
+    problems = _Problem(goal, finite[:, address], jnp.zeros(count, jnp.int32))
+    blank = _Solution(finite[:, address], jnp.zeros(count, bool), jnp.zeros(count, jnp.int32))
+    found = _run(arm, config, problems, jnp.ones(count, bool), blank)
 
-    Args:
-      arm: the arm.
-      T_world_camera: the pose wanted, in world.
-      starts: f32[K, nq] rad or m.
-      qpos: f32[nq] rad or m, the present joints; those that do not move the camera are taken from here.
-      config: iterations, damping and tolerances.
+    def retry(_: Array, state: tuple[_Solution, Array]) -> tuple[_Solution, Array]:
+        best, is_clear = state
+        is_open = best.is_solved & ~is_clear & (best.next_start < config.num_seeds)
+        again = _run(arm, config, problems._replace(first_start=best.next_start), is_open, best)
+        is_better = _clear(arm, again.joints, finite, is_open & again.is_solved)
+        joints = jnp.where(is_better[:, None], again.joints, best.joints)
+        return best._replace(joints=joints, next_start=again.next_start), is_clear | is_better
 
-    Returns:
-      The result, and bool[] whether it is valid: converged, inside the limits and without contact.
-    """
-    results, is_valid = solve_starts(arm, T_world_camera, starts, qpos, config)
-    address = arm.chain.address
-    travel = jnp.linalg.norm(results.qpos[:, address] - _finite(arm, qpos)[address][None], axis=-1)
-    best = jnp.argmin(rank(results, is_valid, travel))
-    return jax.tree.map(lambda leaf: leaf[best], results), is_valid[best]
+    is_clear = _clear(arm, found.joints, finite, found.is_solved)
+    found, _ = jax.lax.fori_loop(0, NUM_RETRIES, retry, (found, is_clear))
+    whole = finite.at[:, address].set(found.joints)
+    return jax.vmap(functools.partial(judge, arm, config))(goal, whole, qpos)
 
 
-def solve_starts(
-    arm: Arm,
-    T_world_camera: SE3,
-    starts: Array,
-    qpos: Array,
-    config: IKConfig,
-) -> tuple[IKResult, Array]:
-    """Returns the result from each of the starts f32[K, nq], leading axis K, and bool[K] which of them are valid."""
-    solve = jax.vmap(_solve, in_axes=(None, None, 0, None, None))
-    results = solve(arm, T_world_camera, starts, qpos, config)
-    is_clear = jax.vmap(lambda q: is_free(arm, forward_kinematics(arm, q)))(results.qpos)
-    return results, results.is_converged & is_clear
+def _clear(arm: Arm, joints: Array, finite: Array, is_open: Array) -> Array:
+    """Returns bool[N]: without contact with the chain at `joints` (f32[N, J]); false where not `is_open`."""
+
+    def step(problem: tuple[Array, Array], _: Array) -> Array:
+        chain, whole = problem
+        free = is_free(arm, forward_kinematics(arm, whole.at[arm.chain.address].set(chain)))
+        return jnp.where(free, 1, 0)
+
+    job = lanes.Job(
+        begin=lambda _, state, is_new: jnp.where(is_new, -1, state),
+        step=step,
+        is_done=lambda state: state >= 0,
+        finish=lambda _, state: state > 0,
+    )
+    blank, states = jnp.zeros(is_open.shape, bool), jnp.zeros(min(MOST_LANES, is_open.shape[0]), jnp.int32)
+    return lanes.run(job, (joints, finite), lanes.in_order(is_open), states, blank)
 
 
-def rank(results: IKResult, is_valid: Array, preference: Array) -> Array:
-    """Returns f32[K], least for the best: valid before converged before the rest, then by preference or by error.
+def _run(arm: Arm, config: IKConfig, problems: _Problem, is_open: Array, results: _Solution) -> _Solution:
+    job = lanes.Job(
+        functools.partial(_begin, config),
+        functools.partial(_step, arm, config),
+        lambda state: state.is_done,
+        lambda _, state: _Solution(state.joints, jnp.isfinite(state.preference), state.start + 1),
+    )
+    num_lanes = min(MOST_LANES, is_open.shape[0])
+    first = jax.tree.map(lambda leaf: leaf[:num_lanes], problems)
+    states = jax.vmap(functools.partial(_fresh, config))(first)
+    return lanes.run(job, problems, lanes.in_order(is_open), states, results)
 
-    Args:
-      results: IKResult, leading axis K.
-      is_valid: bool[K].
-      preference: f32[K], less is better; below 1e3.
-    """
-    error = jnp.minimum(results.position_error + ROTATION_WEIGHT * results.rotation_error, 1e3)
-    error = jnp.where(jnp.isfinite(error), error, 1e3)
-    order = jnp.where(is_valid, preference, 1e4 + preference)
-    return jnp.where(results.is_converged, order, 1e5 + error)
+
+def _fresh(config: IKConfig, problem: _Problem) -> _State:
+    start = _start(problem, problem.first_start)
+    zero, infinite = jnp.int32(0), jnp.float32(jnp.inf)
+    iterate = levenberg.begin(start, config)
+    return _State(iterate, problem.first_start, zero, jnp.int32(-1), start, infinite, infinite, jnp.bool_(False))
 
 
-def spread_starts(arm: Arm, count: int) -> Array:
-    """Returns f32[count, nq] rad or m: a low-discrepancy sequence over the limits, +-pi where there are none.
+def _begin(config: IKConfig, problem: _Problem, state: _State, is_new: Array) -> _State:
+    return jax.tree.map(lambda a, b: jnp.where(is_new, a, b), _fresh(config, problem), state)
+
+
+def _step(arm: Arm, config: IKConfig, problem: _Problem, state: _State) -> _State:
+    """One evaluation of the kinematics: of Levenberg-Marquardt before convergence, along the nullspace after it."""
+    goal, is_polishing = problem.goal, state.polish >= 0
+    old = state.iterate._replace(cost=jnp.where(is_polishing, jnp.inf, state.iterate.cost))
+    iterate = levenberg.step(arm, goal, old, config)
+    is_solved = _is_within(iterate, config)
+    preference = jnp.where(is_solved, _preference(problem, iterate.joints), jnp.inf)
+    is_better = (preference < state.preference) | (jnp.isinf(state.preference) & (iterate.cost < state.cost))
+    polish = jnp.where(is_polishing | is_solved, state.polish + 1, state.polish)
+    sharp = iterate._replace(damping=jnp.float32(levenberg.DAMPING_RANGE[0]))
+    change = levenberg.update(goal, sharp, -PREFERENCE_RATE * _preference_slope(problem, iterate.joints))
+    along = levenberg.moved(goal, iterate.joints, change, PREFERENCE_STEP)
+    is_spent = (polish < 0) & (state.iterations + 1 >= config.num_iterations)
+    is_last = is_spent & (state.start + 1 >= config.num_seeds)
+    restarted = levenberg.begin(_start(problem, state.start + 1), config)
+    iterate = iterate._replace(trial=jnp.where(polish >= 0, along, iterate.trial))
+    new = _State(
+        iterate=jax.tree.map(lambda a, b: jnp.where(is_spent, a, b), restarted, iterate),
+        start=jnp.where(is_spent & ~is_last, state.start + 1, state.start),
+        iterations=jnp.where(is_spent, 0, state.iterations + 1),
+        polish=polish,
+        joints=jnp.where(is_better, iterate.joints, state.joints),
+        cost=jnp.where(is_better, iterate.cost, state.cost),
+        preference=jnp.minimum(preference, state.preference),
+        is_done=is_last | (polish >= config.num_nullspace_steps),
+    )
+    return jax.tree.map(lambda a, b: jnp.where(state.is_done, b, a), new, state)
+
+
+def _is_within(iterate: Iterate, config: IKConfig) -> Array:
+    rotation = config.rotation_tolerance * levenberg.ROTATION_WEIGHT
+    # A tenth stays in hand, since the angle is measured in another way at the end.
+    return (jnp.sum(iterate.error[:3] ** 2) < (0.9 * config.position_tolerance) ** 2) & (
+        jnp.sum(iterate.error[3:] ** 2) < (0.9 * rotation) ** 2
+    )
+
+
+def _preference(problem: _Problem, joints: Array) -> Array:
+    near = 0.5 * jnp.sum((joints - problem.present) ** 2)
+    return near + 0.5 * LIMIT_WEIGHT * jnp.sum(_excess(problem.goal, joints)[0] ** 2)
+
+
+def _preference_slope(problem: _Problem, joints: Array) -> Array:
+    excess, slope = _excess(problem.goal, joints)
+    return joints - problem.present + LIMIT_WEIGHT * excess * slope
+
+
+def _excess(goal: Goal, joints: Array) -> tuple[Array, Array]:
+    """Returns f32[J] from 0 at the last tenth of the range to +-1 at its end, and its derivative."""
+    width = LIMIT_SHARE * (goal.upper - goal.lower)
+    low, high = goal.lower + width - joints, joints - (goal.upper - width)
+    return (jnp.maximum(high, 0.0) - jnp.maximum(low, 0.0)) / width, 1.0 / width
+
+
+def _start(problem: _Problem, index: Array) -> Array:
+    spread = _spread(problem.goal.lower, problem.goal.upper, index.astype(jnp.float32))
+    return jnp.where(index == 0, problem.present, spread)
+
+
+def _spread(lower: Array, upper: Array, index: Array) -> Array:
+    """Returns f32[J], the start number `index` (f32[]) of a low-discrepancy sequence over the limits.
 
     Source: Roberts, The unreasonable effectiveness of quasirandom sequences (2018): steps are powers of the root of
     x^(d + 1) = x + 1.
     """
-    dimension = arm.home.shape[0]
+    dimension = lower.shape[0]
     root = 2.0
     for _ in range(60):
         root = (1.0 + root) ** (1.0 / (dimension + 1))
-    steps = root ** -jnp.arange(1.0, dimension + 1.0)
-    fraction = jnp.mod(0.5 + jnp.arange(1.0, count + 1.0)[:, None] * steps[None], 1.0)
-    lower, upper = start_limits(arm)
-    return lower[None] + fraction * (upper - lower)[None]
-
-
-def start_limits(arm: Arm) -> tuple[Array, Array]:
-    """Returns lower and upper limits f32[nq], +-pi where the joint has none."""
-    return (
-        jnp.where(jnp.isfinite(arm.lower), arm.lower, -jnp.pi),
-        jnp.where(jnp.isfinite(arm.upper), arm.upper, jnp.pi),
-    )
-
-
-def _finite(arm: Arm, qpos: Array) -> Array:
-    return jnp.clip(jnp.where(jnp.isfinite(qpos), qpos, arm.home), arm.lower, arm.upper)
-
-
-def _solve(arm: Arm, target: SE3, start: Array, qpos: Array, config: IKConfig) -> IKResult:
-    address = arm.chain.address
-    lower, upper = arm.lower[address], arm.upper[address]
-    joints = _finite(arm, start)[address]
-    position, rotation = target.translation(), target.rotation().as_matrix()
-
-    step = functools.partial(_step, arm, (position, rotation), (lower, upper))
-    cost, error, jacobian = _cost(arm, joints, position, rotation)
-    state = _Iterate(joints, cost, error, jacobian, jnp.float32(config.damping))
-    state = jax.lax.fori_loop(0, config.num_iterations, step, state)
-    reached_position, reached_rotation, _ = camera_kinematics(arm, state.joints)
-    position_error = jnp.linalg.norm(reached_position - position)
-    angle = rotation_error(reached_rotation, rotation)
-    return IKResult(
-        qpos=_finite(arm, qpos).at[address].set(state.joints),
-        position_error=position_error,
-        rotation_error=angle,
-        is_converged=(position_error < config.position_tolerance)
-        & (angle < jnp.deg2rad(config.rotation_tolerance_deg)),
-    )
-
-
-def _step(arm: Arm, target: tuple[Array, Array], limits: tuple[Array, Array], _: int, state: _Iterate) -> _Iterate:
-    """One step of Levenberg-Marquardt, kept only if the cost falls; NaN never falls, so the joints stay finite."""
-    lower, upper = limits
-    descent = state.jacobian.T @ state.error
-    is_held = ((state.joints <= lower) & (descent < 0.0)) | ((state.joints >= upper) & (descent > 0.0))
-    # A joint at its limit that would go beyond takes no part, so that the others make up for it.
-    jacobian = jnp.where(is_held, 0.0, state.jacobian)
-    normal = jnp.sum(jacobian[:, None, :] * jacobian[None, :, :], axis=-1) + state.damping * jnp.eye(6)
-    factor = jax.scipy.linalg.cho_factor(normal)
-    change = jnp.sum(jacobian * jax.scipy.linalg.cho_solve(factor, state.error)[:, None], axis=0)
-    change = change * jnp.minimum(1.0, MAX_STEP / jnp.maximum(jnp.max(jnp.abs(change)), 1e-9))
-    joints = jnp.clip(state.joints + change, lower, upper)
-    cost, error, jacobian = _cost(arm, joints, *target)
-    is_better = cost < state.cost
-    damping = jnp.clip(state.damping * jnp.where(is_better, DAMPING_FALL, DAMPING_RISE), *DAMPING_RANGE)
-    new = _Iterate(joints, cost, error, jacobian, damping)
-    return jax.tree.map(lambda a, b: jnp.where(is_better, a, b), new, state._replace(damping=damping))
-
-
-def _cost(arm: Arm, joints: Array, position: Array, rotation: Array) -> tuple[Array, Array, Array]:
-    reached_position, reached_rotation, jacobian = camera_kinematics(arm, joints)
-    relative = jnp.sum(rotation[:, None, :] * reached_rotation[None, :, :], axis=-1)
-    error = jnp.concatenate([position - reached_position, ROTATION_WEIGHT * SO3.from_matrix(relative).log()])
-    weights = jnp.array([1.0, 1.0, 1.0, ROTATION_WEIGHT, ROTATION_WEIGHT, ROTATION_WEIGHT])
-    return jnp.sum(error * error), error, jacobian * weights[:, None]
+    steps = np.float32(root) ** -np.arange(1, dimension + 1, dtype=np.float32)
+    return lower + jnp.mod(0.5 + index * steps, 1.0) * (upper - lower)

@@ -55,6 +55,18 @@ def reachability(reach: ReachabilityMap) -> Figure:
 
 
 @styled
+def mount_heights(heights: Sequence[float], coverages: Sequence[float], best: float) -> Figure:
+    """Draws the share of the wanted views that the arm reaches, against the height (m) of its mount."""
+    figure = Figure(figsize=(6, 3.2))
+    axes = figure.add_subplot()
+    axes.plot(heights, 100.0 * np.asarray(coverages), marker="o", markersize=3)
+    axes.axvline(best, linestyle=":", color="black")
+    axes.set(xlabel="mount height (m)", ylabel="wanted views in reach (%)", ylim=(-3, 103))
+    axes.set_title(f"Best mount height: {best:.2f} m")
+    return figure
+
+
+@styled
 def training(lines: Sequence[Mapping[str, Any]], config: Config) -> Figure:
     """Draws losses, reward, success and temperature over training.
 

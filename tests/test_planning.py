@@ -1,0 +1,214 @@
+"""Edges, trees, shortcuts and timing, against C MuJoCo and against what a path must be."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from planning_oracle import Oracle, free_joints
+from second_arm import MJCF
+from vsearch_jax import collision
+from vsearch_jax.arm import build_arm, clearance, forward_kinematics
+from vsearch_jax.config import PlanningConfig, SceneConfig
+from vsearch_jax.planning import PlanningError, edge_is_free, rrt, rrt_connect, sample, start_limits, time_path
+from vsearch_jax.planning.edges import planning_gaps
+from vsearch_jax.scene import SceneError, build_scene
+from vsearch_jax.types import Path, PlanStatus
+
+CONFIG = PlanningConfig()
+NUM_PROBLEMS = 64
+
+
+class _Problems:
+    """Random free starts and goals among posts, and what RRT-Connect makes of them."""
+
+    def __init__(self, count: int, seed: int) -> None:
+        self.scene = build_scene(SceneConfig(obstacles="posts"))
+        self.arm = build_arm(self.scene)
+        self.oracle = Oracle(self.scene)
+        lower, upper = start_limits(self.arm)
+        joints = free_joints(self.scene, lower, upper, seed, 2 * count)
+        self.start, self.goal = joints[:count], joints[count:]
+        self.goal[:, 7:] = self.start[:, 7:]
+        good = [self.oracle.is_free(q) for q in self.goal]  # with the other fingers
+        self.start, self.goal = self.start[good], self.goal[good]
+        self.keys = jax.random.split(jax.random.key(seed), len(self.start))
+
+        self.plan = jax.jit(jax.vmap(lambda k, a, b: rrt_connect(self.arm, k, a, b, CONFIG)))
+
+    @functools.cached_property
+    def paths(self):
+        return self.plan(self.keys, self.start, self.goal)
+
+    @functools.cached_property
+    def found(self):
+        return np.asarray(self.paths.status) == PlanStatus.FOUND
+
+
+@pytest.fixture(scope="module")
+def problems() -> _Problems:
+    return _Problems(NUM_PROBLEMS, 0)
+
+
+def _check_paths(problems: _Problems) -> None:
+    waypoints = np.asarray(problems.paths.waypoints)
+    for index in np.flatnonzero(problems.found):
+        path = waypoints[index]
+        np.testing.assert_allclose(path[0], problems.start[index], atol=1e-6)
+        np.testing.assert_allclose(path[-1], problems.goal[index], atol=1e-4)
+        assert problems.oracle.blocked(path) == 0, index
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        assert float(problems.paths.length[index]) == pytest.approx(length, rel=1e-4)
+
+
+def test_paths_are_free_and_join_start_and_goal(problems):
+    assert problems.found.mean() >= 0.95
+    assert (np.asarray(problems.paths.length) > 1.05 * np.linalg.norm(problems.goal - problems.start, axis=1)).any()
+    _check_paths(problems)
+
+
+def test_a_uniform_tree_finds_free_paths_too_and_tells_a_spent_budget(problems):
+    config = dataclasses.replace(CONFIG, max_iterations=64)
+    paths = jax.jit(jax.vmap(lambda k, a, b: rrt(problems.arm, k, a, b, config)))(
+        problems.keys, problems.start, problems.goal
+    )
+    found = np.asarray(paths.status) == PlanStatus.FOUND
+    assert found.mean() >= 0.6
+    assert np.all(np.asarray(paths.status)[~found] == PlanStatus.EXHAUSTED) and not np.all(found)
+    assert np.all(np.isinf(np.asarray(paths.length)[~found]))
+    assert sum(problems.oracle.blocked(path) for path in np.asarray(paths.waypoints)[found]) == 0
+
+
+def test_free_edges_are_free_and_most_blocked_ones_touch(problems):
+    check = jax.jit(jax.vmap(lambda a, b: edge_is_free(problems.arm, a, b, CONFIG)))
+    is_free = np.asarray(check(problems.start, problems.goal))
+    assert 0.1 < is_free.mean() < 0.9
+    touching = np.array(
+        [problems.oracle.blocked(np.stack(ends)) > 0 for ends in zip(problems.start, problems.goal, strict=True)]
+    )
+    assert not np.any(is_free & touching)
+    assert touching[~is_free].mean() > 0.8
+
+
+def test_levers_bound_how_fast_distances_change(problems):
+    random, arm = np.random.default_rng(1), problems.arm
+    step = random.normal(size=problems.start.shape).astype(np.float32) * 0.05
+    step[:, 7:] = 0.0
+    gaps = jax.jit(jax.vmap(lambda q: planning_gaps(arm, q)))
+    change = np.abs(np.asarray(gaps(problems.start + step)) - np.asarray(gaps(problems.start)))
+    bound = np.abs(step[:, :7]) @ np.asarray(arm.planning_pairs.levers).T
+    assert (change - bound).max() < 2e-4  # golden section
+    assert (change / np.maximum(bound, 1e-6)).max() > 0.5
+
+
+def test_planning_pairs_never_claim_more_room_than_there_is(problems):
+    def both(qpos):
+        data = forward_kinematics(problems.arm, qpos)
+        exact = clearance(problems.arm, data)
+        gap = planning_gaps(problems.arm, qpos)
+        parts = (collision.OBJECT, collision.SELF, collision.OBSTACLE)
+        return jnp.stack([collision.least(problems.arm.planning_pairs, gap, part) for part in parts]), exact
+
+    ours, exact = jax.jit(jax.vmap(both))(problems.start)
+    for column, part in enumerate(("object", "self", "obstacles")):
+        near = np.asarray(getattr(exact, part)) < collision.NEVER_NEAR
+        assert np.all(np.asarray(ours)[near, column] <= np.asarray(getattr(exact, part))[near] + 1e-5)
+
+
+def test_bad_ends_have_a_status(problems):
+    start, goal = problems.start[0], problems.goal[0]
+    random = np.random.default_rng(0).uniform(*start_limits(problems.arm), (200, 9)).astype(np.float32)
+    folded = next(qpos for qpos in random if problems.oracle.look(qpos).ncon > 0)
+    outside = goal.copy()
+    outside[1] = 2.5
+    nan = np.where(np.arange(9) == 3, np.nan, start).astype(np.float32)
+    cases = [(folded, goal), (start, folded), (start, outside), (nan, goal), (start, nan), (outside, goal)]
+    starts, goals = problems.start.copy(), problems.goal.copy()  # as many as ever, which is compiled already
+    starts[:6], goals[:6] = (np.stack(ends) for ends in zip(*cases, strict=True))
+    paths = jax.tree.map(lambda leaf: leaf[:6], problems.plan(problems.keys, starts, goals))
+    blocked = [PlanStatus.START_BLOCKED if i in (0, 3, 5) else PlanStatus.GOAL_BLOCKED for i in range(6)]
+    np.testing.assert_array_equal(paths.status, blocked)
+    assert np.all(np.isinf(paths.length)) and np.all(np.isfinite(paths.waypoints))
+
+
+def _times(problems: _Problems, count: int = 400):
+    def timed(path):
+        trajectory = time_path(problems.arm, path, CONFIG)
+        times = jnp.linspace(0.0, 1.0, count) * trajectory.times[-1]
+        joints, velocity = jax.vmap(lambda t: sample(problems.arm, trajectory, t))(times)
+        return times, joints, velocity, trajectory
+
+    return jax.jit(jax.vmap(timed))(problems.paths)
+
+
+def _check_motions(problems: _Problems) -> None:
+    times, joints, velocity, trajectory = (jax.tree.map(np.asarray, part) for part in _times(problems))
+    speed = np.asarray(problems.arm.speed)[:7]
+    acceleration = speed / CONFIG.acceleration_time
+    for i in np.flatnonzero(problems.found):
+        step = times[i, 1]
+        assert np.all(np.abs(velocity[i, :, :7]) <= speed * 1.001)
+        # Between samples the mean acceleration; float32 leaves some noise in a difference of velocities.
+        change = np.diff(velocity[i, :, :7], axis=0) / step
+        assert np.all(np.abs(change) <= acceleration * 1.02 + 1e-3 / step), i
+        np.testing.assert_allclose(velocity[i, 0], 0.0, atol=1e-3)
+        np.testing.assert_allclose(joints[i, 0], problems.start[i], atol=1e-5)
+        np.testing.assert_allclose(joints[i, -1], problems.goal[i], atol=1e-4)
+        mean = 0.5 * (velocity[i, 1:] + velocity[i, :-1]) * step
+        slack = 0.25 * acceleration.max() * step**2 + 2e-5  # where the acceleration jumps between two samples
+        np.testing.assert_allclose(np.diff(joints[i], axis=0), mean, atol=slack)
+        assert all(problems.oracle.is_free(q) for q in joints[i]), i
+    assert np.all(np.isfinite(trajectory.times))
+
+
+def test_motions_keep_the_limits_and_stay_free(problems):
+    _check_motions(problems)
+
+
+def test_a_straight_motion_is_as_fast_as_its_slowest_joint(problems):
+    path = jax.tree.map(lambda leaf: leaf[0], problems.paths)
+    goal = problems.start[0].copy()
+    goal[0] += 1.0
+    waypoints = jnp.concatenate([problems.start[:1], jnp.repeat(goal[None], CONFIG.max_waypoints - 1, axis=0)])
+    trajectory = jax.jit(lambda p: time_path(problems.arm, p, CONFIG))(path.replace(waypoints=waypoints))
+    speed = float(problems.arm.speed[0])
+    assert float(trajectory.times[-1]) == pytest.approx(1.0 / speed + CONFIG.acceleration_time, rel=0.03)
+
+
+def test_missing_limits_are_named(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(MJCF)
+    scene = build_scene(SceneConfig(arm=str(path), mount_height=1.0))
+    arm = build_arm(scene)
+    plan = Path(jnp.repeat(arm.home[None], 4, axis=0), jnp.float32(0.0), jnp.int32(PlanStatus.FOUND))
+    with pytest.raises(PlanningError, match=r"no speed limit for joint arm/rail.*`user`"):
+        time_path(arm, plan, CONFIG)
+    path.write_text(MJCF.replace('name="elbow" axis="0 1 0" range="-2.4 2.4"', 'name="elbow" axis="0 1 0"'))
+    with pytest.raises(SceneError, match=r"joint 'arm/elbow' has no limits"):
+        build_arm(build_scene(SceneConfig(arm=str(path), mount_height=1.0)))
+
+
+def test_obstacles_keep_their_distance_as_mujoco_measures_it(problems):
+    exact = jax.jit(jax.vmap(lambda q: clearance(problems.arm, forward_kinematics(problems.arm, q)).obstacles))(
+        problems.start
+    )
+    for index, qpos in enumerate(problems.start[:16]):
+        data = problems.oracle.look(qpos)
+        theirs = min(
+            mujoco.mj_geomDistance(problems.scene.mj_model, data, a, b, 10.0, None)
+            for a in problems.oracle.moving
+            for b in problems.scene.obstacle_geom_ids
+        )
+        assert float(exact[index]) == pytest.approx(theirs, abs=2e-4)
+
+
+@pytest.mark.slow
+def test_a_thousand_paths_are_free_and_keep_the_limits():
+    problems = _Problems(1100, 7)
+    assert problems.found.sum() >= 1000
+    _check_paths(problems)
+    _check_motions(problems)

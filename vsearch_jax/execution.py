@@ -1,0 +1,69 @@
+"""A motion as the arm's dynamics would do it: MJX steps under position actuators that follow a timed path."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from mujoco import mjx
+
+from vsearch_jax.arm import Arm
+from vsearch_jax.config import PlanningConfig
+from vsearch_jax.planning import duration, sample
+from vsearch_jax.types import Trajectory
+
+
+class Execution(NamedTuple):
+    """What came of a motion.
+
+    Attributes:
+      qpos: f32[nq] rad or m, where the arm came to stand.
+      peak_torque: f32[nv] N m or N, most that the actuators gave, its weight included.
+      energy: f32[] J, of the actuators, where they push.
+      time: f32[] s.
+    """
+
+    qpos: Array
+    peak_torque: Array
+    energy: Array
+    time: Array
+
+
+def execute(arm: Arm, model: mjx.Model, trajectory: Trajectory, config: PlanningConfig) -> Execution:
+    """Returns what comes of following `trajectory` and then `config.settling_time` of rest.
+
+    The commands lead the path by what the actuators' damping makes them lag, so that a steady speed is followed without
+    error. Contacts are not simulated: planning has excluded them. Under `vmap` the motions run one after another, since
+    MJX's chain of bodies is slow when batched on CPU (see `kinematics`).
+
+    Args:
+      arm: the arm.
+      model: `Scene.mjx_model`; each joint of the camera's chain has a position actuator.
+      trajectory: of `planning.time_path`.
+      config: the settling time.
+    """
+    return _run(arm, model, trajectory, jnp.float32(config.settling_time))
+
+
+@jax.custom_batching.sequential_vmap
+def _run(arm: Arm, model: mjx.Model, trajectory: Trajectory, settling_time: Array) -> Execution:
+    gain, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+    lead = damping / jnp.maximum(gain, 1e-9)
+    in_qpos = jnp.asarray(model.jnt_qposadr)[jnp.asarray(model.actuator_trnid[:, 0])]
+    total = duration(trajectory) + settling_time
+
+    def step(state: tuple[mjx.Data, Array, Array]) -> tuple[mjx.Data, Array, Array]:
+        data, peak, energy = state
+        joints, velocity = sample(arm, trajectory, data.time)
+        command = joints[in_qpos] + lead * velocity[in_qpos]
+        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # mjx promotes freely
+            data = mjx.step(model, data.replace(ctrl=command))
+        torque = data.qfrc_actuator
+        work = jnp.sum(jnp.maximum(torque * data.qvel, 0.0)) * model.opt.timestep
+        return data, jnp.maximum(peak, jnp.abs(torque)), energy + work
+
+    start = (arm.data.replace(qpos=trajectory.waypoints[0]), jnp.zeros(model.nv), jnp.zeros(()))
+    data, peak, energy = jax.lax.while_loop(lambda state: state[0].time < total, step, start)
+    return Execution(data.qpos, peak, energy, data.time)

@@ -1,0 +1,52 @@
+"""What an arm reaches, in pictures, and where to hang it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from vsearch_jax import report
+from vsearch_jax.config import Config, ConfigError, SceneConfig
+from vsearch_jax.mounting import best_mount, scan_mounts
+
+# Azimuths of the maps: what an arm reaches changes little between.
+NUM_AZIMUTHS = 24
+
+
+def draw_reach(
+    out: Path, scene: SceneConfig, band_deg: tuple[float, float], heights: tuple[float, float, float]
+) -> str:
+    """Draws the reachability map at the best mount height and the coverage of each, and returns a line to tell.
+
+    Args:
+      out: folder of `reachability.png` and `mount_heights.png`.
+      scene: arm, object and view sphere; its mount height is not used.
+      band_deg: lowest and highest elevation wanted, in degrees.
+      heights: lowest and highest mount height to try and the step between, in m.
+
+    Raises:
+      ConfigError: the heights are no range, or from none of them a wanted view is in reach; the map is drawn then too.
+      SceneError: arm or object can't be loaded.
+    """
+    low, high, step = heights
+    if not (0.0 < low <= high and step > 0.0):
+        raise ConfigError(f"heights are {low:g} {high:g} {step:g}; allowed: lowest, highest and step in m, above 0")
+    ik = dataclasses.replace(Config().ik, map_azimuths=NUM_AZIMUTHS)
+    tried = np.arange(int((high - low) / step + 1e-6) + 1) * step + low
+    mounts = scan_mounts(dataclasses.replace(Config(), scene=scene, ik=ik), tried.tolist(), band_deg)
+    best = best_mount(mounts)
+    report.reachability(best.reach).savefig(out / "reachability.png")
+    curve = report.mount_heights([mount.height for mount in mounts], [mount.coverage for mount in mounts], best.height)
+    curve.savefig(out / "mount_heights.png")
+    views = f"views from {band_deg[0]:g} to {band_deg[1]:g} degrees of elevation"
+    if best.coverage == 0.0:
+        raise ConfigError(
+            f"arm {scene.arm!r} reaches none of the {views} around object {scene.object!r} from any height from "
+            f"{low:g} to {high:g} m; {out / 'reachability.png'} shows what it does reach"
+        )
+    return (
+        f"mount height {best.height:.3g} m: {100 * best.coverage:.1f} % of the {views} are in reach; see "
+        f"{out / 'reachability.png'}"
+    )
