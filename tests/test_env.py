@@ -1,4 +1,4 @@
-"""The view-search task: SPEC.md 7 line by line, against C MuJoCo's kinematics, and under brax's own wrappers."""
+"""The view-search task: the thesis 4.3 line by line, against C MuJoCo's kinematics, and under brax's own wrappers."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from vsearch_jax.config import SceneConfig
 from vsearch_jax.meshes import inspect, read_mesh
 from vsearch_jax.scene import SceneError, available, build_scene, xml_folder
 
-# SPEC.md 2: KUKA LWR 4+.
+# Thesis 3.1: KUKA LWR 4+.
 LIMITS_DEG = [170, 120, 170, 120, 170, 120, 170]
 SPEEDS_DEG = [100, 110, 100, 130, 130, 180, 180]
 TORQUES = [176, 176, 100, 100, 100, 38, 38]

@@ -149,14 +149,16 @@ def _read(run: Path, step: int, item: str, arguments: ocp.args.CheckpointArgs) -
 def _one_error() -> Iterator[None]:
     # Of the arrays that orbax writes at once the first that fails raises. It also logs a traceback for each of its
     # threads, and the arrays still under way find their event loop closed, which Python reports as unraisable.
-    log, hook = logging.getLogger("absl"), sys.unraisablehook
-    level = log.level
-    log.setLevel(logging.CRITICAL)
+    logs, hook = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
+    levels = [log.level for log in logs]
+    for log in logs:
+        log.setLevel(logging.CRITICAL)
     sys.unraisablehook = lambda report: None if str(report.exc_value) == "Event loop is closed" else hook(report)
     try:
         yield
     finally:
-        log.setLevel(level)
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)
         sys.unraisablehook = hook
 
 

@@ -50,7 +50,7 @@ class Train:
     seed: Annotated[int | None, _option("INT", "0")] = None
     """Of all random numbers of the run."""
     object: _Name = None
-    """Short for --scene.object: a name (see xml/objects) or the path of an MJCF file of primitive geoms."""
+    """Short for --scene.object: a name (see xml/objects) or the path of an MJCF or mesh file."""
     arm: _Name = None
     """Short for --scene.arm: a name (see xml/arm) or the path of an MJCF file."""
     input: _Input = None

@@ -1,4 +1,4 @@
-"""The view-search task (SPEC.md 7) as a `brax.envs.Env`."""
+"""The view-search task (thesis 4.3) as a `brax.envs.Env`."""
 
 from __future__ import annotations
 

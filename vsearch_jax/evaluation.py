@@ -1,4 +1,4 @@
-"""The thesis's protocol (SPEC.md 4-7) for every searcher as one jitted function of batched trials."""
+"""The thesis's protocol (thesis, chapters 3.6 to 4.3) for every searcher as one jitted function of batched trials."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vsearch_jax.search import SearchArgs, cma_es, random_search, sac
 from vsearch_jax.types import Camera, ReachabilityMap, SearchResult, Sight, TrainState, View
 
 FALSE_POSITIVE_DEG = 10.0
-"""A found view whose rotation is further than this from the target's is a false positive (SPEC.md 4)."""
+"""A found view whose rotation is further than this from the target's is a false positive (thesis 3.6)."""
 
 
 def evaluate(state: TrainState, config: Config) -> dict[str, Any]:

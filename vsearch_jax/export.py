@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,9 @@ def export(folder: Path, state: TrainState, config: Config, seed: int = 0) -> No
     folder.mkdir(parents=True, exist_ok=True)
     for name, function in exported.items():
         (folder / f"{name}.stablehlo").write_bytes(function.serialize())
-    (folder / "interface.json").write_text(json.dumps(_interface(exported, config), indent=2) + "\n", encoding="utf-8")
+    (folder / "interface.json").write_text(
+        json.dumps(_interface(exported, state, config), indent=2) + "\n", encoding="utf-8"
+    )
 
 
 def _arguments(config: Config, num_joints: int) -> tuple[jax.ShapeDtypeStruct, ...]:
@@ -111,7 +114,7 @@ def _export(function: Any, arguments: tuple[jax.ShapeDtypeStruct, ...]) -> jax.e
     return jax.export.export(jax.jit(jax.vmap(function)), platforms=PLATFORMS)(*arguments)
 
 
-def _interface(exported: dict[str, jax.export.Exported], config: Config) -> dict[str, Any]:
+def _interface(exported: dict[str, jax.export.Exported], state: TrainState, config: Config) -> dict[str, Any]:
     meanings = {
         "encoder": (["picture"], ["code"]),
         "policy": (["picture", "target_code", "qpos"], ["action", "similarity"]),
@@ -136,10 +139,13 @@ def _interface(exported: dict[str, jax.export.Exported], config: Config) -> dict
             }[config.encoder.input],
             "code": "of a picture; that of the target picture is the policy's target_code",
             "qpos": "present joints of the arm and its gripper, rad and m, in MuJoCo's order",
-            "action": f"change of azimuth and elevation, from -1 to 1, in {config.env.action_scale_deg:g} degrees",
+            "action": f"change of azimuth and elevation, from -1 to 1, in {config.env.action_scale_deg:g} degrees; a "
+            "view off the band's elevations is out of reach",
             "similarity": f"cosine of the two codes; the view is found from {config.env.threshold:g} on",
         },
-        "fovy": "vertical field of view of the camera `wrist` of the arm's MJCF",
+        "fovy_deg": math.degrees(float(state.pool.camera.fovy[0])),
+        "band_deg": [math.degrees(float(end)) for end in state.reach.band],
+        "read": "jax.export.deserialize(bytearray(path.read_bytes())).call(...)",
         "config": config.to_dict(),
     }
 

@@ -168,10 +168,10 @@ def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str,
       OSError: the disk is full or not writable.
     """
     check_finished(run, state, config)
+    lines = read_metrics(run)
     release_memory()  # of the compiled training, some GiB
     began = time.perf_counter()
     arrays = in_thread(evaluate, state, config)
-    lines = read_metrics(run)
     wall_seconds: dict[str, float] = {
         stage: sum(line["seconds"] for line in lines if line["stage"] == stage) for stage in STAGES
     }

@@ -15,7 +15,7 @@ class SceneConfig:
     arm: str = "lwr"
     """A name in xml/arm, or the path of an MJCF file with a site `tcp` and a camera `wrist`."""
     object: str = "teapot"
-    """A name in xml/objects, or the path of an MJCF file with one body of primitive geoms."""
+    """A name in xml/objects, or the path of an MJCF or mesh file."""
     obstacles: str | None = None
     """What else stands around: a name in xml/obstacles, or the path of an MJCF file in world coordinates."""
     mount_height: float = 1.355
@@ -91,7 +91,7 @@ class EncoderConfig:
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """The view-search task (SPEC.md 7)."""
+    """The view-search task (thesis 4.3)."""
 
     threshold: float = 0.98
     """Cosine similarity at which a view counts as found."""
@@ -121,7 +121,7 @@ class EnvConfig:
 
 @dataclass(frozen=True)
 class RandomSearchConfig:
-    """Random search around the best view so far (SPEC.md 5)."""
+    """Random search around the best view so far (thesis 4.1)."""
 
     num_samples: int = 10
     """Views sampled in an epoch."""
@@ -136,7 +136,7 @@ class RandomSearchConfig:
 
 @dataclass(frozen=True)
 class CMAESConfig:
-    """CMA-ES over azimuth and elevation (SPEC.md 6)."""
+    """CMA-ES over azimuth and elevation (thesis 4.2)."""
 
     population: int = 10
     """Views sampled in a generation."""
@@ -152,7 +152,7 @@ class CMAESConfig:
 
 @dataclass(frozen=True)
 class SACConfig:
-    """Soft actor-critic with goal relabelling (SPEC.md 7)."""
+    """Soft actor-critic with goal relabelling (thesis 4.3)."""
 
     num_seeds: int = 1
     """Policies trained side by side, each from its own random numbers."""

@@ -1,4 +1,4 @@
-"""Domain randomisation (SPEC.md 3): of lights and camera before rendering, of the picture after it."""
+"""Domain randomisation (thesis 3.3): of lights and camera before rendering, of the picture after it."""
 
 from __future__ import annotations
 

@@ -218,16 +218,21 @@ def _whisker(axes: Axes, place: float, ends: np.ndarray) -> None:
 def search_strip(images: np.ndarray, cosines: Sequence[float], target: np.ndarray) -> Figure:
     """Draws what the camera saw at each step of a search, its cosine below, and the target image at the end.
 
+    Eight pictures stand in a row.
+
     Args:
       images: f32[N, H, W, 3] in [0, 1].
       cosines: N cosine similarities with the target.
       target: f32[H, W, 3] in [0, 1].
     """
     count = len(images) + 1
-    figure = Figure(figsize=(1.6 * count, 2.1))
+    columns, rows = min(count, 8), -(-count // 8)
+    figure = Figure(figsize=(1.6 * columns, 2.1 * rows))
     captions = [f"step {step}: {cosine:.3f}" if step else f"start: {cosine:.3f}" for step, cosine in enumerate(cosines)]
-    row = figure.subplots(1, count, squeeze=False)[0]
-    for axes, image, caption in zip(row, [*images, target], [*captions, "target"], strict=True):
+    grid = figure.subplots(rows, columns, squeeze=False).reshape(-1)
+    for axes in grid[count:]:
+        axes.set_visible(False)
+    for axes, image, caption in zip(grid[:count], [*images, target], [*captions, "target"], strict=True):
         axes.imshow(np.clip(image, 0, 1))
         axes.set_xlabel(caption)
         axes.set(xticks=[], yticks=[])

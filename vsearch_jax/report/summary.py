@@ -59,7 +59,7 @@ def results(arrays: Mapping[str, Any], config: Config, wall_seconds: Mapping[str
 
 
 def summarize(trials: Mapping[str, Any], patience: int) -> dict[str, Any]:
-    """Returns the measures of SPEC.md 4 over trials.
+    """Returns the measures of the thesis (3.6) over trials.
 
     Args:
       trials: arrays [N] of `evaluate` for one searcher.

@@ -1,4 +1,4 @@
-"""CMA-ES over azimuth and elevation (SPEC.md 6), evosax's, with bounds and restarts.
+"""CMA-ES over azimuth and elevation (thesis 4.2), evosax's, with bounds and restarts.
 
 evosax 0.3.2 follows Hansen's tutorial (arXiv 1604.00772) with its parameters of 2016. Its generation counter is one
 ahead in the stall indicator h_sigma (tutorial, page 28), so states start at -1 here; with that it equals `cma` 4.5 to

@@ -1,4 +1,4 @@
-"""Random search around the best view so far (SPEC.md 5)."""
+"""Random search around the best view so far (thesis 4.1)."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def search(key: Array, step_fn: StepFn, args: SearchArgs, config: Config) -> Sea
 
     The policy acts by its mean. In some episodes in a thousand that goes round in a circle beside the target. So one
     that no longer comes nearer, once it is near or after `config.evaluation.patience` steps, is helped in turns: three
-    steps of random search (SPEC.md 5), to views around the best one of the way; two steps of a sweep around the
+    steps of random search (thesis 4.1), to views around the best one of the way; two steps of a sweep around the
     object; four of the policy, which now comes from elsewhere. Where the best view is far from the target it sweeps
     until the cosine rises. One step of help also follows one that the arm could not do, which a mean would repeat for
     ever.
