@@ -5,6 +5,9 @@ contacts, with the table's clearance as the table's margin. OMPL calls it for ev
 by its own distances and only checked by it afterwards. Needs the extra `benchmark`.
 """
 
+# OMPL's bindings are not typed: a state is indexed, and setStartAndGoalStates takes two of them.
+# pyright: reportIndexIssue=false, reportArgumentType=false
+
 from __future__ import annotations
 
 import argparse
@@ -17,7 +20,7 @@ import jax
 import mink
 import mujoco
 import numpy as np
-from ompl import base, geometric, util
+from ompl import base, geometric, util  # pyright: ignore[reportMissingImports] # in the extra `benchmark` only
 
 from vsearch_jax.arm import Arm, build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import IKConfig, PlanningConfig, SceneConfig

@@ -82,7 +82,7 @@ def _directions(case: Case, size: int) -> np.ndarray:
 
 def ours(case: Case, size: int, has_shadows: bool) -> Callable[[], object]:
     """Returns a call that draws colour, depth and geom numbers of the whole batch in one program."""
-    scene = render.compile_scene(case.model).replace(has_shadows=has_shadows)
+    scene = render.compile_scene(case.model).replace(has_shadows=has_shadows)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     data = render.poses(case.data)
 
     def one(position: jax.Array, rotation: jax.Array) -> object:

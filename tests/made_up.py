@@ -33,7 +33,11 @@ def trials(shape: tuple[int, ...], generations: int, seed: int = 0) -> dict[str,
 def evaluation(num_seeds: int = 1) -> dict[str, Any]:
     """Made-up arrays of `evaluate`."""
     shape = (num_seeds, 40)
-    steps = {"evaluations": np.full(shape, 4), "steps_lower_bound": np.full(shape, 3)}
+    steps = {
+        "evaluations": np.full(shape, 4),
+        "steps_lower_bound": np.full(shape, 3),
+        "num_helped": np.zeros(shape, np.int32),
+    }
     return {"random_search": trials((12,), 30), "cma_es": trials((12,), 30, 1), "sac": trials(shape, 20) | steps}
 
 

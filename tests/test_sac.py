@@ -311,7 +311,7 @@ def episodes(env, actor, keys):
 def test_the_policy_finds_any_target_in_few_more_steps_than_the_bound(policy):
     env = probes.SphereEnv(ENV)
     starts, result = episodes(env, policy, jax.random.split(jax.random.key(7), 500))
-    ends, is_found = result.end, np.asarray(result.score) >= ENV.threshold
+    ends, is_found = result.end.state, np.asarray(result.score) >= ENV.threshold
     assert is_found.mean() >= 0.93
     initial, target = starts.pipeline_state.sight.view, starts.pipeline_state.target.view
     bound = jax.vmap(env.steps_lower_bound)(initial, target)

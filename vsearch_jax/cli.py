@@ -153,7 +153,10 @@ def _value_of(option: str, arguments: Sequence[str]) -> str | None:
 def _with_shortcuts(command: Train) -> Train:
     scene, encoder = command.config.scene, command.config.encoder
     scene = dataclasses.replace(
-        scene, object=_absolute(command.object or scene.object), arm=_absolute(command.arm or scene.arm)
+        scene,
+        object=_absolute(command.object or scene.object),
+        arm=_absolute(command.arm or scene.arm),
+        obstacles=scene.obstacles and _absolute(scene.obstacles),
     )
     encoder = dataclasses.replace(encoder, input=command.input or encoder.input)
     return dataclasses.replace(command, config=dataclasses.replace(command.config, scene=scene, encoder=encoder))

@@ -34,7 +34,8 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Any]:
       `sac` of [seeds, episodes]: `is_success` bool, `evaluations` i32, `final_cosine` f32, `rotation_error` f32 rad,
       `frobenius_angle` f32 rad, `translation_error` f32 m, `is_false_positive` bool, `unreachable` i32,
       `best_scores` f32[..., G], `initial_view` and `target_view` View of f32 rad; for `sac` also
-      `steps_lower_bound` i32: no policy needs fewer steps.
+      `steps_lower_bound` i32, fewer steps than which no policy needs, and `num_helped` i32, steps that were not the
+      policy's.
 
     Raises:
       ConfigError: the arm can't reach the target view, or nothing at every azimuth.
@@ -114,14 +115,15 @@ def map_batched(function: Any, xs: Any, batch_size: int) -> Any:
 
 
 def look_from_anywhere(env: ViewSearchEnv, item: tuple[Array, View]) -> tuple[Sight, Array]:
-    """Returns what is seen from a view when the arm comes from random joints, and bool[] is_reachable.
+    """Returns what is seen from a view with joints near random ones, however they are come by, and bool[] is_reachable.
 
     Args:
       env: the task.
       item: PRNG key and View of f32[] rad.
     """
     key, view = item
-    return env.look(view, env.random_joints(key))
+    qpos, is_reachable = env.solve(view, env.random_joints(key))
+    return env.see(view, qpos), is_reachable
 
 
 def camera_at(env: ViewSearchEnv, view: View, qpos: Array) -> Camera:
@@ -228,8 +230,9 @@ def run_episode(key: Array, *, env: ViewSearchEnv, actor: Any, grid: Sight) -> d
         initial_score=start.metrics["similarity"],
     )
     result = sac.search(search_key, env.step, args, env.config)
-    last = episode_of(result.end)
+    last = episode_of(result.end.state)
     return outcome(env.config, result, last.sight.camera, last.target.camera) | {
+        "num_helped": result.end.num_helped,
         "initial_view": first.sight.view,
         "target_view": first.target.view,
         "steps_lower_bound": steps_lower_bound(first.sight.view, first.target, grid, env.reach.band, env.config),
@@ -249,8 +252,8 @@ def record_search(state: TrainState, config: Config) -> dict[str, Array]:
     initial_key, target_key = jax.random.split(jax.random.fold_in(state.key, 2**31 - 2))
     target_view = protocol_target(config)
     far_side = View(wrap_angle(target_view.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))
-    initial, _ = env.look(far_side, env.random_joints(initial_key))
-    target, _ = env.look(target_view, env.random_joints(target_key))
+    initial, _ = look_from_anywhere(env, (initial_key, far_side))
+    target, _ = look_from_anywhere(env, (target_key, target_view))
     start = env.start(initial, target)
 
     def step(state: Any, _: None) -> tuple[Any, Any]:

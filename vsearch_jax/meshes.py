@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-MESH_SUFFIXES = (".obj", ".stl", ".msh", ".ply", ".glb", ".gltf", ".off", ".3mf", ".dae")
+MESH_SUFFIXES = (".obj", ".stl", ".msh", ".ply", ".glb", ".gltf", ".off")
 # A file of these suffixes is MuJoCo's own to read, so that normals and texture coordinates stay.
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 

@@ -111,7 +111,7 @@ def _train_chunks(
         checkpoint.save(run, state, config)
         on_chunk(new_step, seconds, log.lines[step - new_step :])
         step = new_step
-        if is_stopping.is_set() and step < config.num_iterations:
+        if is_stopping.is_set():
             raise KeyboardInterrupt
     log.close()
     return state
@@ -129,7 +129,8 @@ def stop_requested(on_interrupt: OnInterrupt) -> Iterator[threading.Event]:
         if event.is_set():
             raise KeyboardInterrupt
         event.set()
-        on_interrupt()
+        with contextlib.suppress(RuntimeError):  # the signal may have come within a print
+            on_interrupt()
 
     if threading.current_thread() is not threading.main_thread():
         yield event
@@ -168,7 +169,7 @@ def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str,
       OSError: the disk is full or not writable.
     """
     check_finished(run, state, config)
-    lines = read_metrics(run)
+    lines, seed = read_metrics(run), run_folder.read_seed(run)
     release_memory()  # of the compiled training, some GiB
     began = time.perf_counter()
     arrays = in_thread(evaluate, state, config)
@@ -177,7 +178,7 @@ def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str,
     }
     wall_seconds["evaluation"] = time.perf_counter() - began
     results = report.results(arrays, config, wall_seconds)
-    results["seed"] = run_folder.read_seed(run)
+    results["seed"] = seed
     search = jax.tree.map(np.asarray, in_thread(record_search, state, config))
     pictures = report.draw(results, arrays, search, state.reach, lines, config)
     report.write(run, results, pictures, config)

@@ -227,7 +227,7 @@ class EvaluationConfig:
     num_episodes: int = 1000
     """Episodes of each policy, initial view and target both random."""
     patience: int = 7
-    """Steps after which a policy that comes no nearer is helped by steps of random search."""
+    """Steps after which a policy that comes no nearer is helped wherever it is; near the target it is at once."""
     batch_size: int = 125
     """Episodes that run side by side."""
 

@@ -24,7 +24,7 @@ class Crooked(NamedTuple):
     """A path that is to be shortened: f32[W, J] its end repeated, i32[] its configurations, f32[nq] joints, its key."""
 
     waypoints: Array
-    count: Array
+    num_points: Array
     qpos: Array
     key: Array
 
@@ -34,7 +34,7 @@ class Shortcut(NamedTuple):
 
     Attributes:
       waypoints: f32[W, J] rad or m, the path so far, its end repeated.
-      count: i32[], its configurations.
+      num_points: i32[], its configurations.
       edge: Edge that may replace what lies between its ends.
       first: i32[], the waypoint before the edge's start.
       last: i32[], the waypoint after the edge's end.
@@ -42,7 +42,7 @@ class Shortcut(NamedTuple):
     """
 
     waypoints: Array
-    count: Array
+    num_points: Array
     edge: Edge
     first: Array
     last: Array
@@ -59,14 +59,16 @@ def empty(arm: Arm, config: PlanningConfig) -> Shortcut:
 def begin(arm: Arm, problem: Crooked, state: Shortcut, is_new: Array) -> Shortcut:
     """Starts on the path of `problem` where `is_new`."""
     fresh = _propose(
-        arm, problem, state._replace(waypoints=problem.waypoints, count=problem.count, attempts=jnp.int32(0))
+        arm,
+        problem,
+        state._replace(waypoints=problem.waypoints, num_points=problem.num_points, attempts=jnp.int32(0)),
     )
     return jax.tree.map(lambda a, b: jnp.where(is_new, a, b), fresh, state)
 
 
 def is_done(config: PlanningConfig, state: Shortcut) -> Array:
     """Returns bool[]: all attempts are spent, or the path is straight."""
-    return (state.attempts >= config.num_shortcuts) | (state.count <= 2)
+    return (state.attempts >= config.num_shortcuts) | (state.num_points <= 2)
 
 
 def step(arm: Arm, config: PlanningConfig, problem: Crooked, state: Shortcut) -> Shortcut:
@@ -75,8 +77,10 @@ def step(arm: Arm, config: PlanningConfig, problem: Crooked, state: Shortcut) ->
     edge = jax.lax.fori_loop(0, SAMPLES_PER_STEP, lambda _, edge: forward(edge), state.edge)
     is_free = is_whole(edge)
     taken = _cut(state._replace(edge=edge))
-    path = jax.tree.map(lambda a, b: jnp.where(is_free, a, b), taken, (state.waypoints, state.count))
-    following = _propose(arm, problem, state._replace(waypoints=path[0], count=path[1], attempts=state.attempts + 1))
+    path = jax.tree.map(lambda a, b: jnp.where(is_free, a, b), taken, (state.waypoints, state.num_points))
+    following = _propose(
+        arm, problem, state._replace(waypoints=path[0], num_points=path[1], attempts=state.attempts + 1)
+    )
     waiting = state._replace(edge=edge)
     new = jax.tree.map(lambda a, b: jnp.where(is_settled(edge), a, b), following, waiting)
     return jax.tree.map(lambda a, b: jnp.where(is_done(config, state), b, a), new, state)
@@ -89,17 +93,17 @@ def _propose(arm: Arm, problem: Crooked, state: Shortcut) -> Shortcut:
     key = jax.random.fold_in(problem.key, state.attempts)
     places = jax.random.uniform(key, (NUM_CANDIDATES, 2)) * ends[-1]
     # Half of them start at a waypoint: those are what a path has too many of.
-    corners = ends[jax.random.randint(key, (NUM_CANDIDATES // 2,), 0, jnp.maximum(state.count - 2, 1))]
+    corners = ends[jax.random.randint(key, (NUM_CANDIDATES // 2,), 0, jnp.maximum(state.num_points - 2, 1))]
     places = jnp.sort(places.at[: NUM_CANDIDATES // 2, 0].set(corners), axis=1)
-    segment = jnp.minimum(jnp.searchsorted(ends, places), state.count - 2).astype(jnp.int32)
+    segment = jnp.minimum(jnp.searchsorted(ends, places), state.num_points - 2).astype(jnp.int32)
     length = jnp.maximum(lengths[segment], 1e-9)
     share = jnp.clip((places - (ends[segment] - lengths[segment])) / length, 0.0, 1.0)
     below, above = state.waypoints[segment], state.waypoints[segment + 1]
     points = below + share[..., None] * (above - below)
     saving = places[:, 1] - places[:, 0] - jnp.linalg.norm(points[:, 1] - points[:, 0], axis=-1)
     num_cut = segment[:, 1] - segment[:, 0]
-    fits = (num_cut > 0) & (state.count + 2 - num_cut <= state.waypoints.shape[0])
-    best = jnp.argmax(jnp.where(fits, saving, -jnp.inf))
+    fits = (num_cut > 0) & (state.num_points + 2 - num_cut <= state.waypoints.shape[0])
+    best = jnp.argmax(jnp.where(fits, saving, -jnp.inf))  # pyright: ignore[reportArgumentType] # an array, of three arguments
     is_worth = fits[best] & (saving[best] > LEAST_SAVING * ends[-1])
     edge = edge_between(arm, points[best, 0], points[best, 1])
     return state._replace(edge=edge._replace(is_blocked=~is_worth), first=segment[best, 0], last=segment[best, 1] + 1)
@@ -107,7 +111,7 @@ def _propose(arm: Arm, problem: Crooked, state: Shortcut) -> Shortcut:
 
 def _cut(state: Shortcut) -> tuple[Array, Array]:
     """Returns the path, and its configurations, with the edge between its waypoints `first` and `last`."""
-    count = state.count + 3 - (state.last - state.first)
+    count = state.num_points + 3 - (state.last - state.first)
     place = jnp.minimum(jnp.arange(state.waypoints.shape[0]), count - 1)
     source = jnp.where(place <= state.first, place, place - state.first - 3 + state.last)
     path = state.waypoints[jnp.clip(source, 0, state.waypoints.shape[0] - 1)]

@@ -57,7 +57,7 @@ def camera_from_matrix(T_world_camera: SE3, matrix: Array) -> Camera:
       matrix: f32[3, 3] pixels, ((fx, 0, cx), (0, fy, cy), (0, 0, 1)), for the size of the images that are drawn.
     """
     intrinsics = jnp.stack([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]).astype(jnp.float32)
-    return camera_from_pose(T_world_camera, 0.0).replace(intrinsics=intrinsics)
+    return camera_from_pose(T_world_camera, 0.0).replace(intrinsics=intrinsics)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
 
 
 def magnified(camera: Camera, factor: int) -> Camera:
@@ -65,7 +65,8 @@ def magnified(camera: Camera, factor: int) -> Camera:
     if camera.intrinsics is None:
         return camera
     focal, center = camera.intrinsics[:2], camera.intrinsics[2:]
-    return camera.replace(intrinsics=jnp.concatenate([factor * focal, factor * (center + 0.5) - 0.5]))
+    intrinsics = jnp.concatenate([factor * focal, factor * (center + 0.5) - 0.5])
+    return camera.replace(intrinsics=intrinsics)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
 
 
 def pinhole(camera: Camera, size: tuple[int, int]) -> Pinhole:

@@ -82,7 +82,10 @@ def surface_of(
         normal = _turned_back(turn, materialize(outward, zero), away, zero)
     point, rgb, tint = (x * depth, y * depth, -depth), (rows[10], rows[11], rows[12]), None
     if scene.textures is not None:
-        texcoord = affine(faces[16:24], local) if faces is not None and len(faces) == 24 else None
+        texcoord = None
+        if faces is not None and len(faces) == 24:
+            u, v = affine(faces[16:24], local)
+            texcoord = (u, v)
         local = materialize(local, zero)
         tint = texturing.colour(scene.textures, hits.slot, starts, (size, local), texcoord)
         tint = materialize(tint, zero)

@@ -174,7 +174,7 @@ def _depth_at(triangles: Triangles, view: View, face: Array, pixel: tuple[Array,
     whole = areas[0] + areas[1] + areas[2]
     met = (areas[0] * depth[0] + areas[1] * depth[1] + areas[2] * depth[2]) / jnp.where(whole == 0.0, 1.0, whole)
     is_met = ((_least(areas) >= 0.0) | (_most(areas) <= 0.0)) & (whole != 0.0)
-    return jnp.where(is_met & (view.is_parallel | (met > 0.0)), met, jnp.inf)
+    return jnp.where(is_met & (view.is_parallel | (met > 0.0)), met, jnp.inf)  # pyright: ignore[reportReturnType] # an array
 
 
 class _Pairs(NamedTuple):

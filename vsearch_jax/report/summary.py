@@ -32,14 +32,11 @@ def results(arrays: Mapping[str, Any], config: Config, wall_seconds: Mapping[str
       config: the run's config.
       wall_seconds: wall time of each stage of the run.
     """
-    patience = config.evaluation.patience
-    searchers = {
-        name: summarize(jax.tree.map(np.asarray, arrays[name]), patience) for name in ("random_search", "cma_es")
-    }
+    searchers = {name: summarize(jax.tree.map(np.asarray, arrays[name])) for name in ("random_search", "cma_es")}
     policies = jax.tree.map(np.asarray, arrays["sac"])
-    pooled = summarize(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), policies), patience)
+    pooled = summarize(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), policies))
     seeds = [
-        {"seed": seed, **summarize(jax.tree.map(lambda x, s=seed: x[s], policies), patience)}
+        {"seed": seed, **summarize(jax.tree.map(lambda x, s=seed: x[s], policies))}
         for seed in range(policies["is_success"].shape[0])
     ]
     pooled |= {"environment_steps": config.sac.num_environment_steps, "seeds": seeds}
@@ -58,12 +55,11 @@ def results(arrays: Mapping[str, Any], config: Config, wall_seconds: Mapping[str
     }
 
 
-def summarize(trials: Mapping[str, Any], patience: int) -> dict[str, Any]:
+def summarize(trials: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the measures of the thesis (3.6) over trials.
 
     Args:
       trials: arrays [N] of `evaluate` for one searcher.
-      patience: steps after which random search may help a policy.
     """
     rotation = np.rad2deg(trials["rotation_error"])
     evaluations = trials["evaluations"]
@@ -84,7 +80,7 @@ def summarize(trials: Mapping[str, Any], patience: int) -> dict[str, Any]:
         bound = trials["steps_lower_bound"]
         summary |= _mean("steps_lower_bound_mean", bound)
         summary["evaluations_over_lower_bound"] = float(evaluations.mean() / bound.mean())
-        summary |= _rate("fallback_rate", (evaluations > patience).sum(), evaluations.size)
+        summary |= _rate("helped_rate", (trials["num_helped"] > 0).sum(), evaluations.size)
     return summary
 
 

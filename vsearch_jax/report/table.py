@@ -45,7 +45,7 @@ MEASURES = (
     Measure("translation_error_cm_mean", "translational error, mean (cm)", digits=2),
     Measure("false_positive_rate", "false positives (%)", 100.0, 2),
     Measure("unreachable_rate", "unreachable (%)", 100.0, 2),
-    Measure("fallback_rate", "helped by random steps (%)", 100.0, 2),
+    Measure("helped_rate", "episodes with steps of help (%)", 100.0, 2),
     Measure("environment_steps", "environment steps of training", digits=0),
 )
 

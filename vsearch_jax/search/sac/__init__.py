@@ -3,9 +3,10 @@
 from vsearch_jax.search.sac.agent import act, init, td_target, update
 from vsearch_jax.search.sac.relabel import relabel
 from vsearch_jax.search.sac.replay import ReplayState, init_replay, insert, sample
-from vsearch_jax.search.sac.rollout import PolicyTask, search
+from vsearch_jax.search.sac.rollout import PolicyEnd, PolicyTask, search
 
 __all__ = [
+    "PolicyEnd",
     "PolicyTask",
     "ReplayState",
     "act",

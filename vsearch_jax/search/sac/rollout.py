@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -20,8 +20,8 @@ from vsearch_jax.search.common import (
     Record,
     SearchArgs,
     add_generation,
+    fold_into_band,
     is_running,
-    sample_around_best,
     start_record,
     to_result,
 )
@@ -31,9 +31,9 @@ from vsearch_jax.types import EpisodeState, SearchResult, View
 _IMPROVEMENT = 3e-3
 """A step that raises the best cosine by less comes no nearer."""
 _NEAR = 0.9
-"""From this cosine on, the target is some ten degrees off."""
-_SAMPLES, _SWEEPS, _TRIES = 3, 2, 4
-"""Steps in a turn of help: of random search, of a sweep, of the policy."""
+"""From this cosine on, the target is some ten degrees off at most."""
+_FOUND_RADIUS = math.radians(3.0)
+"""About how far from the target views still meet the threshold."""
 
 StepFn = Callable[[State, Array], State]
 """The environment's `step`, (state, action) -> state; to this searcher what `ScoreFn` is to the others."""
@@ -53,6 +53,18 @@ class PolicyTask:
     start: State
 
 
+class PolicyEnd(NamedTuple):
+    """What `SearchResult.end` holds of this searcher.
+
+    Attributes:
+      state: brax State at the end of the episode.
+      num_helped: i32[], steps that were not the policy's.
+    """
+
+    state: State
+    num_helped: Array
+
+
 @flax.struct.dataclass
 class _Carry:
     """State of the loop.
@@ -60,23 +72,28 @@ class _Carry:
     Attributes:
       record: Record.
       state: brax State.
-      lost_at: i32[], the step from which on the policy is helped; the episode's length while it is not.
+      num_helped: i32[], steps that were not the policy's.
+      num_around: i32[], those of them around the best view, since that has come nearer.
     """
 
     record: Record
     state: State
-    lost_at: Array
+    num_helped: Array
+    num_around: Array
 
 
 def search(key: Array, step_fn: StepFn, args: SearchArgs, config: Config) -> SearchResult:
     """Follows the policy until the threshold is met or the episode is out of steps.
 
-    The policy acts by its mean. In some episodes in a thousand that goes round in a circle beside the target. So one
-    that no longer comes nearer, once it is near or after `config.evaluation.patience` steps, is helped in turns: three
-    steps of random search (thesis 4.1), to views around the best one of the way; two steps of a sweep around the
-    object; four of the policy, which now comes from elsewhere. Where the best view is far from the target it sweeps
-    until the cosine rises. One step of help also follows one that the arm could not do, which a mean would repeat for
-    ever.
+    The policy acts by its mean. In some episodes in a thousand that goes round in a circle, mostly a little beside the
+    target. So where a step came no nearer, and the best view is near the target or `config.evaluation.patience` steps
+    are done, the next step is not the policy's:
+
+    - With the best view near the target, 1 - c tells how far that is, as it grows with the square of the distance, but
+      not where. The steps go around the best view at that distance, a quarter turn each, then at twice the distance.
+    - Else they sweep around the object, in one direction, with random elevations.
+
+    A step of this kind also follows one that the arm could not do, which a mean would repeat for ever.
 
     A step is one generation of one image; as a policy is measured by its episode length, the image of the start does
     not count. An episode is at least one step long, as in training, where the start may meet the threshold already.
@@ -85,20 +102,20 @@ def search(key: Array, step_fn: StepFn, args: SearchArgs, config: Config) -> Sea
       key: PRNG key of the random steps.
       step_fn: the environment's `step`.
       args: SearchArgs of one problem, its `task` a PolicyTask; `initial` and `initial_score` are those of the task.
-      config: the run's; `sac`, `env`, `evaluation.patience` and `random_search.k` are read.
+      config: the run's; `sac`, `env` and `evaluation.patience` are read.
 
     Returns:
-      SearchResult with best_scores f32[episode_length] and the State at the end of the episode. Its `view` and `score`
-      are those of the end, where the arm stands, not the best of the way.
+      SearchResult with best_scores f32[episode_length] and `end`, a PolicyEnd. Its `view` and `score` are those of the
+      end, where the arm stands, not the best of the way.
     """
     start: State = args.task.start
     record = start_record(args.initial, jnp.asarray(-jnp.inf, jnp.float32), config.env.episode_length)
     record = dataclasses.replace(record, evaluations=jnp.int32(0), unreachable=jnp.int32(0))
-    carry = _Carry(record=record, state=start, lost_at=jnp.int32(config.env.episode_length))
+    carry = _Carry(record=record, state=start, num_helped=jnp.int32(0), num_around=jnp.int32(0))
     body = functools.partial(_step, key, step_fn, args, config)
     carry = jax.lax.while_loop(lambda carry: is_running(carry.record, args.threshold), body, carry)
-    result, end = to_result(carry.record), carry.state
-    return dataclasses.replace(result, view=_view(end), score=end.metrics["similarity"], end=end)
+    result, end = to_result(carry.record), PolicyEnd(carry.state, carry.num_helped)
+    return dataclasses.replace(result, view=_view(end.state), score=end.state.metrics["similarity"], end=end)
 
 
 def _step(key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: _Carry) -> _Carry:
@@ -106,34 +123,44 @@ def _step(key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: 
     steps = record.generation
     is_near = record.score >= _NEAR
     has_improved = record.score - record.best_scores[steps - 2] > _IMPROVEMENT
-    is_lost = ~has_improved & ((steps >= config.evaluation.patience) | (is_near & (steps >= 2)))
-    lost_at = jnp.minimum(carry.lost_at, jnp.where(is_lost, steps, config.env.episode_length))
-    turn = (steps - lost_at) % (_SAMPLES + _SWEEPS + _TRIES)
-    is_helped = (steps >= lost_at) & (turn < _SAMPLES + _SWEEPS) & (is_near | ~has_improved)
+    is_helped = ~has_improved & ((steps >= config.evaluation.patience) | (is_near & (steps >= 2)))
     is_helped |= state.info["is_reachable"] < 0.5
-    is_sampled = is_near & ((steps < lost_at) | (turn < _SAMPLES))
+    num_around = jnp.where(has_improved, 0, carry.num_around)
 
-    view = _random_view(key, record, state, args.band, config)
-    view = jax.tree.map(lambda near, swept: jnp.where(is_sampled, near, swept), *view)
+    around, swept = _around_best(key, record, num_around, args), _swept(key, steps, state, args.band, config)
+    view = jax.tree.map(lambda a, b: jnp.where(is_near, a, b), around, swept)
     observation: Array = state.obs  # pyright: ignore[reportAssignmentType] # brax allows dictionaries too
     action = act(None, args.task.actor, observation, config.sac)
     state = step_fn(state, jnp.where(is_helped, _action_to(view, state, config), action))
     score = jnp.where(state.info["is_reachable"] > 0.5, state.metrics["similarity"], -jnp.inf)
     views, scores = jax.tree.map(lambda x: x[None], (_view(state), score))
-    return _Carry(record=add_generation(record, views, scores, args.threshold), state=state, lost_at=lost_at)
-
-
-def _random_view(key: Array, record: Record, state: State, band: Array, config: Config) -> tuple[View, View]:
-    """Returns a view around the best one, and one that lies a step further round the object."""
-    side_key, sample_key, elevation_key = jax.random.split(key, 3)
-    sample_key, elevation_key = (jax.random.fold_in(k, record.generation) for k in (sample_key, elevation_key))
-    near = sample_around_best(sample_key, record, band, config.random_search.k, 1)
-    side = jax.random.rademacher(side_key, (), jnp.float32)  # the same in all steps
-    swept = View(
-        azimuth=wrap_angle(_view(state).azimuth + side * math.radians(config.env.action_scale_deg)),
-        elevation=jax.random.uniform(elevation_key, (), jnp.float32, *band),
+    return _Carry(
+        record=add_generation(record, views, scores, args.threshold),
+        state=state,
+        num_helped=carry.num_helped + is_helped,
+        num_around=num_around + (is_helped & is_near),
     )
-    return View(near.azimuth[0], near.elevation[0]), swept
+
+
+def _around_best(key: Array, record: Record, number: Array, args: SearchArgs) -> View:
+    """Returns view `number` (i32[]) of those around the best one: four at its distance, four further."""
+    missing = jnp.maximum(1.0 - record.score, 0.0) / (1.0 - args.threshold)
+    radius = _FOUND_RADIUS * jnp.sqrt(missing) * (1 + number // 4)
+    angle = 2.0 * jnp.pi * jax.random.uniform(key) + 0.5 * jnp.pi * number + 0.25 * jnp.pi * (number // 4)
+    return View(
+        azimuth=wrap_angle(record.view.azimuth + radius * jnp.cos(angle)),
+        elevation=fold_into_band(record.view.elevation + radius * jnp.sin(angle), args.band),
+    )
+
+
+def _swept(key: Array, steps: Array, state: State, band: Array, config: Config) -> View:
+    """Returns a view that lies a step further round the object, in the same direction at every step."""
+    side_key, elevation_key = jax.random.split(key)
+    side = jax.random.rademacher(side_key, (), jnp.float32)
+    return View(
+        azimuth=wrap_angle(_view(state).azimuth + side * math.radians(config.env.action_scale_deg)),
+        elevation=jax.random.uniform(jax.random.fold_in(elevation_key, steps), (), jnp.float32, *band),
+    )
 
 
 def _action_to(view: View, state: State, config: Config) -> Array:
