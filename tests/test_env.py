@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -52,10 +54,9 @@ def test_an_arm_without_a_band_is_refused(env):
     nowhere = env.reach.replace(band=jnp.full(2, jnp.nan))
     with pytest.raises(ConfigError, match=r"'lwr' .*mount_height 1.355 reaches no elevation at every azimuth"):
         vs.ViewSearchEnv(CONFIG, env.encoder, nowhere)
-    state = vs.init(jax.random.key(0), CONFIG)
     for run in (vs.train, vs.evaluate):
         with pytest.raises(ConfigError, match="reaches no elevation"):
-            run(state.replace(reach=nowhere), CONFIG)
+            run(SimpleNamespace(reach=nowhere), CONFIG)
 
 
 def test_initial_view_and_target_are_random_over_the_band(env, reset):
@@ -142,26 +143,3 @@ def test_brax_wrappers_run_it(env, as_brax_computes):
         lengths.append(np.asarray(state.info["steps"]).tolist())
         assert np.isfinite(state.obs).all()
     assert max(max(length) for length in lengths) == 3
-
-
-@pytest.mark.brax_trainer
-@pytest.mark.filterwarnings("ignore:jax.device_put_replicated is deprecated:DeprecationWarning")
-def test_braxs_own_sac_trains_on_it(env, as_brax_computes):
-    from brax.training.agents.sac import train as brax_sac
-
-    seen = []
-    _, params, _ = brax_sac.train(
-        env,
-        num_timesteps=2000,
-        episode_length=CONFIG.env.episode_length,
-        num_envs=16,
-        num_eval_envs=16,
-        num_evals=2,
-        min_replay_size=256,
-        grad_updates_per_step=4,
-        batch_size=64,
-        progress_fn=lambda steps, metrics: seen.append((steps, metrics["eval/episode_reward"])),
-    )
-    assert seen[-1][0] >= 2000
-    assert all(np.isfinite(reward) for _, reward in seen)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))

@@ -66,10 +66,12 @@ def moves():
     return _moves(4)
 
 
+@pytest.mark.slow
 def test_the_arm_ends_at_the_planned_view(moves):
     _check(moves, 1.0)
 
 
+@pytest.mark.slow
 def test_c_mujoco_follows_the_same_way_without_contact(moves):
     scene, arm, paths, trajectories, done, _, _, _ = moves
     model, oracle = scene.mj_model, Oracle(scene)

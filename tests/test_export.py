@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import made_up
 from vsearch_jax import encoder as encoders
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.export import export
@@ -35,7 +36,8 @@ def trained(config: Config) -> Any:
     return SimpleNamespace(
         encoder=encoder.replace(latent_mean=0.1 * jax.random.normal(keys[0], encoder.latent_mean.shape)),
         sac=jax.vmap(lambda key: sac.init(key, config.sac, observation_size, 2))(keys),
-        pool=SimpleNamespace(qpos=jnp.zeros((5, NUM_JOINTS))),
+        pool=SimpleNamespace(qpos=jnp.zeros((5, NUM_JOINTS)), camera=SimpleNamespace(fovy=jnp.full(5, 0.5))),
+        reach=made_up.reach(),
     )
 
 

@@ -71,6 +71,7 @@ def test_paths_are_free_and_join_start_and_goal(problems):
     _check_paths(problems)
 
 
+@pytest.mark.slow
 def test_a_uniform_tree_finds_free_paths_too_and_tells_a_spent_budget(problems):
     config = dataclasses.replace(CONFIG, max_iterations=64)
     paths = jax.jit(jax.vmap(lambda k, a, b: rrt(problems.arm, k, a, b, config)))(

@@ -145,8 +145,9 @@ def _step(key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: 
 def _around_best(key: Array, record: Record, number: Array, args: SearchArgs) -> View:
     """Returns view `number` (i32[]) of those around the best one: four at its distance, four further."""
     missing = jnp.maximum(1.0 - record.score, 0.0) / (1.0 - args.threshold)
-    radius = _FOUND_RADIUS * jnp.sqrt(missing) * (1 + number // 4)
-    angle = 2.0 * jnp.pi * jax.random.uniform(key) + 0.5 * jnp.pi * number + 0.25 * jnp.pi * (number // 4)
+    turn, turns = number.astype(jnp.float32), (number // 4).astype(jnp.float32)
+    radius = _FOUND_RADIUS * jnp.sqrt(missing) * (1.0 + turns)
+    angle = 2.0 * jnp.pi * jax.random.uniform(key) + 0.5 * jnp.pi * turn + 0.25 * jnp.pi * turns
     return View(
         azimuth=wrap_angle(record.view.azimuth + radius * jnp.cos(angle)),
         elevation=fold_into_band(record.view.elevation + radius * jnp.sin(angle), args.band),
