@@ -137,8 +137,8 @@ def _step(key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: 
     return _Carry(
         record=add_generation(record, views, scores, args.threshold),
         state=state,
-        num_helped=carry.num_helped + is_helped,
-        num_around=num_around + (is_helped & is_near),
+        num_helped=carry.num_helped + is_helped.astype(jnp.int32),
+        num_around=num_around + (is_helped & is_near).astype(jnp.int32),
     )
 
 
