@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from vsearch_jax.mounting import best_mount, scan_mounts
 
 # Azimuths of the maps: what an arm reaches changes little between.
 NUM_AZIMUTHS = 24
+MOST_HEIGHTS = 200
 
 
 def draw_reach(
@@ -27,12 +29,15 @@ def draw_reach(
       heights: lowest and highest mount height to try and the step between, in m.
 
     Raises:
-      ConfigError: the heights are no range, or from none of them a wanted view is in reach; the map is drawn then too.
+      ConfigError: heights or band are no range, or a wanted view is in reach from no height; the map is drawn then too.
       SceneError: arm or object can't be loaded.
     """
     low, high, step = heights
-    if not (0.0 < low <= high and step > 0.0):
-        raise ConfigError(f"heights are {low:g} {high:g} {step:g}; allowed: lowest, highest and step in m, above 0")
+    if not (0.0 < low <= high < math.inf and high - low < MOST_HEIGHTS * step < math.inf):
+        allowed = f"lowest, highest and step in m, above 0, {MOST_HEIGHTS} heights at most"
+        raise ConfigError(f"heights are {low:g} {high:g} {step:g}; allowed: {allowed}")
+    if not 0.0 <= band_deg[0] <= band_deg[1] <= 90.0:
+        raise ConfigError(f"band is {band_deg[0]:g} {band_deg[1]:g}; allowed: lowest and highest, from 0 to 90 degrees")
     ik = dataclasses.replace(Config().ik, map_azimuths=NUM_AZIMUTHS)
     tried = np.arange(int((high - low) / step + 1e-6) + 1) * step + low
     mounts = scan_mounts(dataclasses.replace(Config(), scene=scene, ik=ik), tried.tolist(), band_deg)

@@ -119,7 +119,7 @@ def _train(state: TrainState, config: Config) -> tuple[TrainState, dict[str, Arr
         functools.partial(_recorded, update_policy, start),
         ((state.sac, state.env, state.replay), metrics),
     )
-    state = state.replace(sac=sac_state, env=env_state, replay=replay, step=stop)  # pyright: ignore[reportAttributeAccessIssue]
+    state = state.replace(sac=sac_state, env=env_state, replay=replay, step=stop)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     return state, metrics
 
 
@@ -172,12 +172,12 @@ def finish_encoder(_: Array, state: TrainState, *, config: Config) -> TrainState
     keys = jax.random.split(jax.random.fold_in(state.key, _POOL), config.encoder.pool_size)
     pool, raw = jax.lax.map(functools.partial(_raw_sight, env), keys, batch_size=_POOL_BATCH)
     mean, whitening = encoders.fit_whitening(raw, config.encoder.whitening_power)
-    encoder = state.encoder.replace(latent_mean=mean, whitening=whitening)  # pyright: ignore[reportAttributeAccessIssue]
+    encoder = state.encoder.replace(latent_mean=mean, whitening=whitening)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     pool = pool.replace(code=jax.vmap(functools.partial(encoders.code_of, encoder))(raw))
     shape = (config.sac.num_seeds, config.sac.num_envs)
     start = functools.partial(pool_start, env=env, pool=pool)
     states = jax.vmap(jax.vmap(start))(jax.random.split(jax.random.fold_in(state.key, _RESTART), shape))
-    return state.replace(encoder=encoder, pool=pool, env=states)  # pyright: ignore[reportAttributeAccessIssue]
+    return state.replace(encoder=encoder, pool=pool, env=states)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
 
 
 def _raw_sight(env: ViewSearchEnv, key: Array) -> tuple[Sight, Array]:

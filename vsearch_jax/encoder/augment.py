@@ -69,7 +69,7 @@ def jitter_camera(key: Array, camera: Camera) -> Camera:
     tilt = jax.random.uniform(aim_key, (2,), minval=-_MAX_SHIFT, maxval=_MAX_SHIFT) * camera.fovy
     turn = SO3.exp(jnp.append(tilt, 0.0)).as_matrix()
     fovy = camera.fovy * _uniform(scale_key, (), _SCALE_RANGE)
-    return camera.replace(rotation=camera.rotation @ turn, fovy=fovy)  # pyright: ignore[reportAttributeAccessIssue]
+    return camera.replace(rotation=camera.rotation @ turn, fovy=fovy)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
 
 
 def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Array:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import flax.struct
-import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -112,20 +111,6 @@ def to_result(record: Record) -> SearchResult:
         best_scores=record.best_scores,
         evaluations=record.evaluations,
         unreachable=record.unreachable,
-    )
-
-
-def sample_around_best(key: Array, record: Record, band: Array, k: float, num_samples: int) -> View:
-    """Returns View of f32[num_samples] rad: normal samples around the best view so far, wider the worse its score.
-
-    The standard deviation of azimuth and elevation is k (1 - c) rad, c the best score (-1 at the least). Azimuth wraps;
-    an elevation outside `band` (f32[2] rad) is reflected into it.
-    """
-    noise = jax.random.normal(key, (2, num_samples))
-    sigma = k * (1.0 - jnp.maximum(record.score, -1.0))  # -1 stands in for the -inf of an unreachable start
-    return View(
-        azimuth=wrap_angle(record.view.azimuth + sigma * noise[0]),
-        elevation=fold_into_band(record.view.elevation + sigma * noise[1], band),
     )
 
 

@@ -5,21 +5,23 @@ from __future__ import annotations
 import functools
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.config import RandomSearchConfig
+from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search.common import (
     Record,
     ScoreFn,
     SearchArgs,
     add_generation,
+    fold_into_band,
     initial_score,
     is_running,
-    sample_around_best,
     start_record,
     to_result,
 )
-from vsearch_jax.types import SearchResult
+from vsearch_jax.types import SearchResult, View
 
 
 def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearchConfig) -> SearchResult:
@@ -45,8 +47,11 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearch
 
 
 def _epoch(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearchConfig, record: Record) -> Record:
-    views = sample_around_best(
-        jax.random.fold_in(key, record.generation), record, args.band, config.k, config.num_samples
+    noise = jax.random.normal(jax.random.fold_in(key, record.generation), (2, config.num_samples))
+    sigma = config.k * (1.0 - jnp.maximum(record.score, -1.0))  # -1 stands in for the -inf of an unreachable start
+    views = View(
+        azimuth=wrap_angle(record.view.azimuth + sigma * noise[0]),
+        elevation=fold_into_band(record.view.elevation + sigma * noise[1], args.band),
     )
     scores = jax.vmap(score_fn, in_axes=(0, None))(views, args.task)
     return add_generation(record, views, scores, args.threshold)
