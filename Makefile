@@ -14,7 +14,7 @@ PYTHON ?= $(call first_python,11,python3 python3.11 python3.12 python3.13)
 PYTHON_NEWEST ?= $(call first_python,12,python3.12 python3.13 python3 $(wildcard $(HOME)/.pyenv/versions/3.12*/bin/python))
 PRESET ?= cpu
 RUN ?= runs/$(PRESET)-$(shell date +%Y%m%d-%H%M%S)
-PYTEST_ARGS ?= -n 2 --dist loadfile
+PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
 
 VENV := .venv
 VENV_NEWEST := .venv-newest

@@ -21,11 +21,21 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=30)
 hypothesis.settings.load_profile("repeatable")
 
+# Files that take minutes, each on one worker: they start first, so that none is left alone at the end.
+LONG = (
+    "test_training.py",
+    "test_brax_trainer.py",
+    "test_evaluation.py",
+    "test_ik.py",
+    "test_planning.py",
+    "test_cli.py",
+)
 JAX_VERSION = tuple(int(part) for part in jax.__version__.split(".")[:2])
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skips tests of brax's own trainers where jax lacks what they call."""
+    """Puts long files first, and skips tests of brax's own trainers where jax lacks what they call."""
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
     if JAX_VERSION >= (0, 10):
         reason = pytest.mark.skip(
             reason=f"brax's trainers call jax.device_put_replicated, gone from jax {jax.__version__}"

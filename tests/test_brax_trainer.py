@@ -24,7 +24,7 @@ def test_braxs_own_sac_trains_on_it():
         episode_length=CONFIG.env.episode_length,
         num_envs=16,
         num_eval_envs=16,
-        num_evals=2,
+        num_evals=1,
         min_replay_size=256,
         grad_updates_per_step=4,
         batch_size=64,

@@ -154,15 +154,23 @@ class ViewSearchEnv(Env):
         The arm's configuration varies: of the solutions found it is the one nearest to random joints.
         Where IK fails between the cells of the map, the view of the nearest reachable cell is returned.
         """
+        view, joints = self.random_view(key)
+        qpos, is_reachable = self.solve(view, joints)
+        cell_view, cell_qpos = self.nearest_view(view)
+        view = jax.tree.map(lambda a, b: jnp.where(is_reachable, a, b), view, cell_view)
+        return view, jnp.where(is_reachable, qpos, cell_qpos)
+
+    def random_view(self, key: Array) -> tuple[View, Array]:
+        """Returns a view, uniform over the band, and random joints f32[nq] to come from."""
         azimuth_key, elevation_key, joints_key = jax.random.split(key, 3)
         azimuth = jax.random.uniform(azimuth_key, minval=-jnp.pi, maxval=jnp.pi)
         elevation = jax.random.uniform(elevation_key, minval=self.reach.band[0], maxval=self.reach.band[1])
-        view = View(azimuth, elevation)
-        qpos, is_reachable = self.solve(view, self.random_joints(joints_key))
+        return View(azimuth, elevation), self.random_joints(joints_key)
+
+    def nearest_view(self, view: View) -> tuple[View, Array]:
+        """Returns the view of the map's reachable cell nearest to `view`, and the cell's joints f32[nq]."""
         cell = nearest_cell(self.reach, view)
-        cell_view = View(self.reach.azimuths[cell[0]], self.reach.elevations[cell[1]])
-        view = jax.tree.map(lambda a, b: jnp.where(is_reachable, a, b), view, cell_view)
-        return view, jnp.where(is_reachable, qpos, self.reach.qpos[cell])
+        return View(self.reach.azimuths[cell[0]], self.reach.elevations[cell[1]]), self.reach.qpos[cell]
 
     def random_joints(self, key: Array) -> Array:
         """Returns f32[nq], the joints that move the camera uniform inside their limits, the others at home."""

@@ -121,15 +121,13 @@ def least_along(distance: Callable[[Vector], Array], center: Vector, half_axis: 
     def at(s: Array) -> Array:
         return distance(along(center, s, half_axis))
 
+    if center[0].size == 0:
+        return jnp.zeros_like(center[0])
     low = jnp.full(center[0].shape, -1.0)
     high = -low
-    state = (
-        low,
-        high,
-        at(high - GOLDEN * (high - low)),
-        at(low + GOLDEN * (high - low)),
-        jnp.minimum(at(low), at(high)),
-    )
+    first = jnp.stack([high - GOLDEN * (high - low), low + GOLDEN * (high - low), low, high])
+    f_low, f_high, *f_ends = jax.vmap(at)(first)  # four calls would be compiled one by one
+    state = (low, high, f_low, f_high, jnp.minimum(*f_ends))
     *_, f_low, f_high, f_ends = jax.lax.fori_loop(0, SEARCH_ITERATIONS, functools.partial(_narrow, at), state)
     return jnp.minimum(jnp.minimum(f_low, f_high), f_ends)
 

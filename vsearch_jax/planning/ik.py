@@ -102,20 +102,21 @@ def _solve_batch(config: IKConfig, arm: Arm, batch: tuple[Array, Array, Array]) 
     goal = Goal(positions, rotations, *limits)
     problems = _Problem(goal, finite[:, address], jnp.zeros(count, jnp.int32))
     blank = _Solution(finite[:, address], jnp.zeros(count, bool), jnp.zeros(count, jnp.int32))
-    found = _run(arm, config, problems, jnp.ones(count, bool), blank)
 
-    def retry(_: Array, state: tuple[_Solution, Array]) -> tuple[_Solution, Array]:
+    def attempt(index: Array, state: tuple[_Solution, Array]) -> tuple[_Solution, Array]:
         best, is_clear = state
-        is_open = best.is_solved & ~is_clear & (best.next_start < config.num_seeds)
+        is_retry = best.is_solved & ~is_clear & (best.next_start < config.num_seeds)
+        is_open = is_retry | (index == 0)
         again = _run(arm, config, problems._replace(first_start=best.next_start), is_open, best)
-        is_better = _clear(arm, again.joints, finite, is_open & again.is_solved)
-        joints = jnp.where(is_better[:, None], again.joints, best.joints)
-        return best._replace(joints=joints, next_start=again.next_start), is_clear | is_better
+        is_free = _clear(arm, again.joints, finite, is_open & again.is_solved)
+        joints = jnp.where((is_free | (index == 0))[:, None], again.joints, best.joints)
+        return _Solution(joints, again.is_solved | best.is_solved, again.next_start), is_clear | is_free
 
-    is_clear = _clear(arm, found.joints, finite, found.is_solved)
-    found, _ = jax.lax.fori_loop(0, NUM_RETRIES, retry, (found, is_clear))
+    # One loop for the first attempt and the others: what it holds is compiled once.
+    found, _ = jax.lax.fori_loop(0, 1 + NUM_RETRIES, attempt, (blank, jnp.zeros(count, bool)))
     whole = finite.at[:, address].set(found.joints)
-    return jax.vmap(functools.partial(judge, arm, config))(goal, whole, qpos)
+    data = jax.vmap(functools.partial(forward_kinematics, arm))(whole)
+    return jax.vmap(functools.partial(judge, arm, config))(goal, data, qpos)
 
 
 def _clear(arm: Arm, joints: Array, finite: Array, is_open: Array) -> Array:

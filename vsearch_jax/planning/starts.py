@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxlie import SE3
+from mujoco import mjx
 
-from vsearch_jax.arm import Arm, camera_kinematics, forward_kinematics, is_free
+from vsearch_jax.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.config import IKConfig
 from vsearch_jax.planning import levenberg
 from vsearch_jax.planning.levenberg import Goal, goal_of
@@ -52,14 +53,14 @@ def solve_starts(
     """Returns the result from each of the starts f32[K, nq], leading axis K, and bool[K] which of them are valid."""
     goal, address = goal_of(arm, T_world_camera), arm.chain.address
 
-    def solve(start: Array) -> IKResult:
+    def solve(start: Array) -> tuple[IKResult, Array]:
         iterate = levenberg.begin(finite_joints(arm, start)[address], config)
         body = functools.partial(levenberg.step, arm, goal, config=config)
         iterate = jax.lax.fori_loop(0, config.num_iterations + 1, lambda _, iterate: body(iterate), iterate)
-        return judge(arm, config, goal, finite_joints(arm, qpos).at[address].set(iterate.joints), qpos)
+        data = forward_kinematics(arm, finite_joints(arm, qpos).at[address].set(iterate.joints))
+        return judge(arm, config, goal, data, qpos), is_free(arm, data)
 
-    results = jax.vmap(solve)(starts)
-    is_clear = jax.vmap(lambda q: is_free(arm, forward_kinematics(arm, q)))(results.qpos)
+    results, is_clear = jax.vmap(solve)(starts)
     return results, results.is_converged & is_clear
 
 
@@ -90,16 +91,16 @@ def finite_joints(arm: Arm, qpos: Array) -> Array:
     return jnp.clip(jnp.where(jnp.isfinite(qpos), qpos, arm.home), arm.lower, arm.upper)
 
 
-def judge(arm: Arm, config: IKConfig, goal: Goal, whole: Array, qpos: Array) -> IKResult:
-    """Returns what the joints `whole` (f32[nq]) are worth, measured anew; `qpos` were the present ones."""
-    position, rotation, _ = camera_kinematics(arm, whole[arm.chain.address])
+def judge(arm: Arm, config: IKConfig, goal: Goal, data: mjx.Data, qpos: Array) -> IKResult:
+    """Returns what the joints of `data`, which holds their kinematics, are worth; `qpos` (f32[nq]) were the present."""
+    position, rotation = data.cam_xpos[arm.camera_id], data.cam_xmat[arm.camera_id]
     position_error = jnp.linalg.norm(position - goal.position)
     angle = jnp.linalg.norm(levenberg.turn(goal.rotation, rotation, config))
     is_finite = jnp.all(jnp.isfinite(qpos)) & jnp.isfinite(position_error) & jnp.isfinite(angle)
     is_converged = is_finite & (position_error < config.position_tolerance) & (angle < config.rotation_tolerance)
     status = jnp.where(is_converged, int(IKStatus.SOLVED), int(IKStatus.UNREACHABLE))
     return IKResult(
-        qpos=whole,
+        qpos=data.qpos,
         position_error=position_error,
         rotation_error=angle,
         is_converged=is_converged,

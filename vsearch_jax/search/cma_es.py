@@ -8,6 +8,7 @@ ahead in the stall indicator h_sigma (tutorial, page 28), so states start at -1 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import math
 from collections.abc import Iterator
@@ -21,16 +22,7 @@ from jax import Array
 
 from vsearch_jax.config import CMAESConfig
 from vsearch_jax.geometry import wrap_angle
-from vsearch_jax.search.common import (
-    Record,
-    ScoreFn,
-    SearchArgs,
-    add_generation,
-    initial_score,
-    is_running,
-    start_record,
-    to_result,
-)
+from vsearch_jax.search.common import Method, Record, ScoreFn, SearchArgs, add_generation, run, start_record
 from vsearch_jax.types import SearchResult, View
 
 # One unit of the search space is a quarter turn of azimuth and half the band's height of elevation.
@@ -43,12 +35,13 @@ _STALL_IMPROVEMENT = 3e-3
 
 
 @flax.struct.dataclass
-class _Carry:
-    """State of the loop.
+class _State:
+    """State of the search.
 
     Attributes:
       record: Record.
       strategy: evosax's state.
+      population: f32[N, 2] units, the generation that was asked for.
       run_fitness: f32[], best fitness since the last restart at a random view.
       run_point: f32[2] units, where it was seen.
       stalled: i32[], generations since it improved.
@@ -56,6 +49,7 @@ class _Carry:
 
     record: Record
     strategy: Any
+    population: Array
     run_fitness: Array
     run_point: Array
     stalled: Array
@@ -83,37 +77,63 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: CMAESConfig)
     Returns:
       SearchResult with best_scores f32[config.max_generations].
     """
+    return run(key, score_fn, args, method(config))
+
+
+def method(config: CMAESConfig) -> Method:
+    """Returns the searcher's parts."""
     sigma = math.radians(config.sigma_deg) / _AZIMUTH_UNIT
     algorithm = CMA_ES(population_size=config.population, solution=jnp.zeros(2))
     with _evosax_promotion():
         params = algorithm.default_params.replace(std_init=jnp.asarray(sigma, jnp.float32))
-    carry = _Carry(
-        record=start_record(args.initial, initial_score(score_fn, args), config.max_generations),
-        strategy=_start(algorithm, params, _to_units(args.initial, args.band)),
+    return Method(
+        start=functools.partial(_begin, (algorithm, params), config),
+        ask=functools.partial(_ask, (algorithm, params)),
+        tell=functools.partial(_tell, (algorithm, params)),
+        record=lambda state: state.record,
+        num_views=config.population,
+    )
+
+
+def _begin(method: tuple[CMA_ES, Any], config: CMAESConfig, args: SearchArgs, score: Array) -> _State:
+    return _State(
+        record=start_record(args.initial, score, config.max_generations),
+        strategy=_start(*method, _to_units(args.initial, args.band)),
+        population=jnp.zeros((config.population, 2)),
         run_fitness=jnp.float32(jnp.inf),
         run_point=_to_units(args.initial, args.band),
         stalled=jnp.int32(0),
     )
-    body = functools.partial(_generation, key, score_fn, args, (algorithm, params))
-    carry = jax.lax.while_loop(lambda carry: is_running(carry.record, args.threshold), body, carry)
-    return to_result(carry.record)
 
 
-def _generation(key: Array, score_fn: ScoreFn, args: SearchArgs, method: tuple[CMA_ES, Any], carry: _Carry) -> _Carry:
+def _keys(key: Array, state: _State) -> tuple[Array, Array]:
+    """Returns the generation's keys of the samples and of a restart."""
+    sample_key, restart_key = jax.random.split(jax.random.fold_in(key, state.record.generation))
+    return sample_key, restart_key
+
+
+def _ask(method: tuple[CMA_ES, Any], key: Array, args: SearchArgs, state: _State) -> tuple[View, _State]:
     algorithm, params = method
-    sample_key, restart_key = jax.random.split(jax.random.fold_in(key, carry.record.generation))
     with _evosax_promotion():
-        population, strategy = algorithm.ask(sample_key, carry.strategy, params)
-    views, excess = jax.vmap(_to_view, in_axes=(0, None))(population, args.band)
-    scores = jax.vmap(score_fn, in_axes=(0, None))(views, args.task)
+        population, strategy = algorithm.ask(_keys(key, state)[0], state.strategy, params)
+    views, _ = jax.vmap(_to_view, in_axes=(0, None))(population, args.band)
+    return views, dataclasses.replace(state, strategy=strategy, population=population)
+
+
+def _tell(
+    method: tuple[CMA_ES, Any], key: Array, args: SearchArgs, state: _State, views: View, scores: Array
+) -> _State:
+    (algorithm, params), population, strategy = method, state.population, state.strategy
+    sample_key, restart_key = _keys(key, state)
+    _, excess = jax.vmap(_to_view, in_axes=(0, None))(population, args.band)
     fitness = jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2
     with _evosax_promotion():
         strategy, _ = algorithm.tell(sample_key, population, fitness, strategy, params)
     best = jnp.argmin(fitness)
-    stalled = jnp.where(fitness[best] < carry.run_fitness - _STALL_IMPROVEMENT, 0, carry.stalled + 1)
+    stalled = jnp.where(fitness[best] < state.run_fitness - _STALL_IMPROVEMENT, 0, state.stalled + 1)
     is_stalled = stalled >= _STALL_GENERATIONS
-    run_point = jax.lax.select(fitness[best] < carry.run_fitness, population[best], carry.run_point)
-    run_fitness = jnp.minimum(fitness[best], carry.run_fitness)
+    run_point = jax.lax.select(fitness[best] < state.run_fitness, population[best], state.run_point)
+    run_fitness = jnp.minimum(fitness[best], state.run_fitness)
     random_point = jax.random.uniform(restart_key, (2,), minval=jnp.array([-2.0, -1.0]), maxval=jnp.array([2.0, 1.0]))
 
     largest_axis = jnp.sqrt(jnp.linalg.eigvalsh(strategy.C)[-1])
@@ -122,8 +142,9 @@ def _generation(key: Array, score_fn: ScoreFn, args: SearchArgs, method: tuple[C
     strategy = strategy.replace(std=jnp.maximum(strategy.std, floor / largest_axis))
     fresh = _start(algorithm, params, jnp.where(is_stalled, random_point, run_point))
     fresh = fresh.replace(std=jnp.where(is_stalled, params.std_init, ceiling))
-    return _Carry(
-        record=add_generation(carry.record, views, scores, args.threshold),
+    return dataclasses.replace(
+        state,
+        record=add_generation(state.record, views, scores, args.threshold),
         strategy=jax.tree.map(lambda a, b: jnp.where(is_stalled | is_wide, a, b), fresh, strategy),
         run_fitness=jnp.where(is_stalled, jnp.inf, run_fitness),
         run_point=run_point,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -46,6 +48,7 @@ class Record:
       evaluations: i32[], images taken.
       unreachable: i32[], how many of them the arm could not reach.
       generation: i32[], generations done.
+      best: i32[], which of the last generation's views it is; -1 if none of them.
     """
 
     view: View
@@ -54,6 +57,40 @@ class Record:
     evaluations: Array
     unreachable: Array
     generation: Array
+    best: Array
+
+
+class Method(NamedTuple):
+    """A black-box searcher in parts, for callers that take the images of several searchers in one place.
+
+    Attributes:
+      start: (args, score of the initial view f32[]) -> state, any pytree.
+      ask: (key, args, state) -> the next generation, View of f32[num_views] rad, and the state that waits for it. The
+        key is the search's, the same in every generation.
+      tell: (key, args, state, views, scores f32[num_views]) -> state.
+      record: state -> Record.
+      num_views: views of a generation.
+    """
+
+    start: Callable[[SearchArgs, Array], Any]
+    ask: Callable[[Array, SearchArgs, Any], tuple[View, Any]]
+    tell: Callable[[Array, SearchArgs, Any, View, Array], Any]
+    record: Callable[[Any], Record]
+    num_views: int
+
+
+def run(key: Array, score_fn: ScoreFn, args: SearchArgs, method: Method) -> SearchResult:
+    """Returns what `method` finds; `score_fn` is vmapped over the views of a generation."""
+    state = method.start(args, initial_score(score_fn, args))
+    body = functools.partial(_generation, key, score_fn, args, method)
+    state = jax.lax.while_loop(lambda state: is_running(method.record(state), args.threshold), body, state)
+    return to_result(method.record(state))
+
+
+def _generation(key: Array, score_fn: ScoreFn, args: SearchArgs, method: Method, state: Any) -> Any:
+    views, state = method.ask(key, args, state)
+    scores = jax.vmap(score_fn, in_axes=(0, None))(views, args.task)
+    return method.tell(key, args, state, views, scores)
 
 
 def initial_score(score_fn: ScoreFn, args: SearchArgs) -> Array:
@@ -70,6 +107,7 @@ def start_record(view: View, score: Array, max_generations: int) -> Record:
         evaluations=jnp.int32(1),
         unreachable=jnp.isneginf(score).astype(jnp.int32),
         generation=jnp.int32(0),
+        best=jnp.int32(-1),
     )
 
 
@@ -95,6 +133,7 @@ def add_generation(record: Record, views: View, scores: Array, threshold: Array)
         evaluations=record.evaluations + jnp.sum(is_taken, dtype=jnp.int32),
         unreachable=record.unreachable + jnp.sum(is_taken & jnp.isneginf(scores), dtype=jnp.int32),
         generation=record.generation + 1,
+        best=jnp.where(is_better, best, -1).astype(jnp.int32),
     )
 
 

@@ -11,15 +11,14 @@ from jax import Array
 from vsearch_jax.config import RandomSearchConfig
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search.common import (
+    Method,
     Record,
     ScoreFn,
     SearchArgs,
     add_generation,
     fold_into_band,
-    initial_score,
-    is_running,
+    run,
     start_record,
-    to_result,
 )
 from vsearch_jax.types import SearchResult, View
 
@@ -40,18 +39,25 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearch
     Returns:
       SearchResult with best_scores f32[config.max_epochs].
     """
-    record = start_record(args.initial, initial_score(score_fn, args), config.max_epochs)
-    body = functools.partial(_epoch, key, score_fn, args, config)
-    record = jax.lax.while_loop(lambda record: is_running(record, args.threshold), body, record)
-    return to_result(record)
+    return run(key, score_fn, args, method(config))
 
 
-def _epoch(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearchConfig, record: Record) -> Record:
+def method(config: RandomSearchConfig) -> Method:
+    """Returns the searcher's parts; its state is the record."""
+    return Method(
+        start=lambda args, score: start_record(args.initial, score, config.max_epochs),
+        ask=functools.partial(_ask, config),
+        tell=lambda key, args, record, views, scores: add_generation(record, views, scores, args.threshold),
+        record=lambda record: record,
+        num_views=config.num_samples,
+    )
+
+
+def _ask(config: RandomSearchConfig, key: Array, args: SearchArgs, record: Record) -> tuple[View, Record]:
     noise = jax.random.normal(jax.random.fold_in(key, record.generation), (2, config.num_samples))
     sigma = config.k * (1.0 - jnp.maximum(record.score, -1.0))  # -1 stands in for the -inf of an unreachable start
     views = View(
         azimuth=wrap_angle(record.view.azimuth + sigma * noise[0]),
         elevation=fold_into_band(record.view.elevation + sigma * noise[1], args.band),
     )
-    scores = jax.vmap(score_fn, in_axes=(0, None))(views, args.task)
-    return add_generation(record, views, scores, args.threshold)
+    return views, record

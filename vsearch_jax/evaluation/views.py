@@ -1,0 +1,71 @@
+"""Views of the protocol, and what is seen from views that are known before the search."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from vsearch_jax.config import Config
+from vsearch_jax.env import ViewSearchEnv
+from vsearch_jax.geometry import wrap_angle
+from vsearch_jax.types import Sight, View
+
+
+def initial_views(config: Config, band: Array) -> View:
+    """Returns View of f32[num_initial_views]: even in azimuth, elevations spread over the band.
+
+    Azimuths lie half a spacing off the axes, equally many in each quadrant; elevations step through 1/6, 3/6 and 5/6 of
+    the band (f32[2] rad).
+    """
+    number = jnp.arange(config.evaluation.num_initial_views, dtype=jnp.float32)
+    azimuth = wrap_angle((number + 0.5) * (2.0 * jnp.pi / config.evaluation.num_initial_views))
+    return View(azimuth, band[0] + (band[1] - band[0]) * (2.0 * (number % 3) + 1.0) / 6.0)
+
+
+def protocol_target(config: Config) -> View:
+    """Returns the target view of random search and CMA-ES, f32[] rad."""
+    settings = config.evaluation
+    return View(wrap_angle(jnp.deg2rad(settings.target_azimuth_deg)), jnp.deg2rad(settings.target_elevation_deg))
+
+
+class Asked(NamedTuple):
+    """A view to look at.
+
+    Attributes:
+      view: View of f32[] rad.
+      qpos: f32[nq] rad or m, joints near which the arm is to stand, however it is come by.
+      is_fixed: bool[]: where the arm does not reach the view, no other will do.
+    """
+
+    view: View
+    qpos: Array
+    is_fixed: Array
+
+
+def look_at(env: ViewSearchEnv, asked: Asked) -> Sight:
+    """Returns what is seen from a view, or from the nearest one of the map if any will do.
+
+    The code of a fixed view that is not reached is 0, which matches nothing.
+    """
+    qpos, is_reachable = env.solve(asked.view, asked.qpos)
+    stays = is_reachable | asked.is_fixed
+    near = env.nearest_view(asked.view)
+    view, qpos = jax.tree.map(lambda a, b: jnp.where(stays, a, b), (asked.view, qpos), near)
+    sight = env.see(view, qpos)
+    code = jnp.where(is_reachable | ~stays, sight.code, 0.0)
+    return sight.replace(code=code)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
+
+
+def map_batched(function: Any, xs: Any, batch_size: int) -> Any:
+    """Returns `function` over the leading axis of `xs`, `batch_size` items at a time.
+
+    Unlike `jax.lax.map` it compiles `function` once also where batches do not come out even: the last item is repeated.
+    """
+    count = jax.tree.leaves(xs)[0].shape[0]
+    batch_size = min(batch_size, count)
+    index = jnp.minimum(jnp.arange(count + -count % batch_size), count - 1)
+    results = jax.lax.map(function, jax.tree.map(lambda x: x[index], xs), batch_size=batch_size)
+    return jax.tree.map(lambda x: x[:count], results)
