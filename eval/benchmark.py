@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import numpy as np
 import render_peers as peers
 from matplotlib.figure import Figure
 
@@ -33,7 +34,7 @@ def _contestants(case: peers.Case, size: int, is_mesh: bool) -> dict[str, Callab
         "vsearch_jax": lambda: peers.ours(case, size, has_shadows=False),
         "vsearch_jax with shadows": lambda: peers.ours(case, size, has_shadows=True),
         f"mj_multiRay, {os.cpu_count()} cores": lambda: peers.multi_ray(case, size),
-        "mujoco.Renderer": lambda: peers.opengl(case, size),
+        f"mujoco.Renderer ({os.environ.get('MUJOCO_GL', 'default')})": lambda: peers.opengl(case, size),
     }
     if is_mesh:
         del contestants["vsearch_jax with shadows"]  # the scene has no light but the headlight
@@ -84,8 +85,37 @@ def plot(rows: list[Row], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
+def compare(cases: dict[str, peers.Case], size: int, path: Path) -> dict[str, float]:
+    """Draws what we and mujoco.Renderer see, and ten times the difference, one row a scene.
+
+    Returns:
+      The mean absolute difference of each scene, in 255ths of full brightness, outlines and edges of shadows included;
+      nothing where there is no OpenGL.
+    """
+    rows, differences = [], {}
+    for name, case in cases.items():
+        own = np.asarray(peers.ours(case, size, has_shadows=True)().rgb[0])
+        try:
+            other = peers.opengl(case, size)()[0] / 255.0
+        except Exception as error:  # it depends on the machine how this fails
+            print(f"pictures are left out: mujoco.Renderer: {' '.join(str(error).split()) or type(error).__name__}")
+            return {}
+        off = np.abs(own - other)
+        differences[name] = 255.0 * float(off.mean())
+        rows.append((name, own, other, np.clip(10.0 * off, 0.0, 1.0)))
+    figure = Figure(figsize=(9, 3.2 * len(rows)), layout="constrained")
+    for axes, (name, *pictures) in zip(figure.subplots(len(rows), 3, squeeze=False), rows, strict=True):
+        titles = (f"{name}: vsearch_jax", "mujoco.Renderer", f"10 x difference, mean {differences[name]:.2f}/255")
+        for panel, title, picture in zip(axes, titles, pictures, strict=True):
+            panel.imshow(np.clip(picture, 0.0, 1.0), interpolation="nearest")
+            panel.set_title(title, fontsize="small")
+            panel.axis("off")
+    figure.savefig(path, dpi=120)
+    return differences
+
+
 def run(arguments: argparse.Namespace) -> None:
-    """Measures all scenes, sizes and batches, prints the ratios, and writes results.json and rates.png."""
+    """Measures all scenes, sizes and batches, prints the ratios, and writes results.json and two pictures."""
     rows: list[Row] = []
     for batch in arguments.batch:
         cases = {"project": peers.project_case(batch)}
@@ -97,8 +127,14 @@ def run(arguments: argparse.Namespace) -> None:
     for name, value in result.items():
         print(f"{value:8.2f}  {name}")
     arguments.out.mkdir(parents=True, exist_ok=True)
+    cases = {
+        "workshop": peers.workshop_case(),
+        "project": peers.project_case(1),
+        "5000 faces": peers.mesh_case(5000, 1),
+    }
+    differences = compare(cases, 384, arguments.out / "pictures.png")
     machine = {"platform": jax.default_backend(), "cores": os.cpu_count(), "jax": jax.__version__}
-    report = {"machine": machine, "rows": rows, "ratios": result}
+    report = {"machine": machine, "rows": rows, "ratios": result, "differences": differences}
     (arguments.out / "results.json").write_text(json.dumps(report, indent=2))
     plot(rows, arguments.out / "rates.png")
 

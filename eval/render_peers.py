@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import trimesh
 
 import vsearch_jax as vs
 from vsearch_jax import geometry, render
-from vsearch_jax.types import Camera, View
+from vsearch_jax.types import Camera, Image, View
 
 FOVY = 0.8
 
@@ -56,6 +57,15 @@ def project_case(batch: int) -> Case:
     return _cameras(scene.mj_model, np.asarray(scene.center), scene.radius, batch)
 
 
+def workshop_case() -> Case:
+    """Returns the scene of examples/: meshes, a height field, textures, a spot light with shadow, one camera."""
+    model = mujoco.MjModel.from_xml_path(str(Path(__file__).resolve().parent.parent / "examples" / "workshop.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    eye = model.camera("room").id
+    return Case(model, data, data.cam_xpos[eye][None], data.cam_xmat[eye].reshape(1, 3, 3))
+
+
 def _around(spec: mujoco.MjSpec, center: np.ndarray, distance: float, batch: int) -> Case:
     spec.visual.global_.offwidth = spec.visual.global_.offheight = 512
     return _cameras(spec.compile(), center, distance, batch)
@@ -80,12 +90,12 @@ def _directions(case: Case, size: int) -> np.ndarray:
     return np.einsum("bij,pj->bpi", case.rotations, local)
 
 
-def ours(case: Case, size: int, has_shadows: bool) -> Callable[[], object]:
+def ours(case: Case, size: int, has_shadows: bool) -> Callable[[], Image]:
     """Returns a call that draws colour, depth and geom numbers of the whole batch in one program."""
     scene = render.compile_scene(case.model).replace(has_shadows=has_shadows)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     data = render.poses(case.data)
 
-    def one(position: jax.Array, rotation: jax.Array) -> object:
+    def one(position: jax.Array, rotation: jax.Array) -> Image:
         return render.render(scene, data, Camera(position, rotation, jnp.float32(FOVY)), (size, size))
 
     program = jax.jit(jax.vmap(one))
@@ -108,7 +118,7 @@ def multi_ray(case: Case, size: int) -> Callable[[], object]:
     return lambda: list(pool.map(one, range(len(directions))))
 
 
-def opengl(case: Case, size: int) -> Callable[[], object]:
+def opengl(case: Case, size: int) -> Callable[[], list[np.ndarray]]:
     """Returns a call that draws the batch's colours with mujoco.Renderer, one after another.
 
     Raises:

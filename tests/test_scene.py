@@ -1,3 +1,5 @@
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -237,13 +239,54 @@ def test_a_mesh_with_holes_is_taken_and_reported(tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    ("size", "words"), [(85.0, "85 m long.*millimetres.*0.001"), (1e-3, "0.001 m long.*in metres")]
+    ("size", "words"), [(85.0, "85 m long.*millimetres.*0.001"), (1e-3, "0.001 m long.*mesh_scale")]
 )
 def test_a_mesh_of_another_unit_is_told(tmp_path, size, words):
     path = tmp_path / "part.stl"
     path.write_bytes(trimesh.creation.box((size, size, size)).export(file_type="stl"))
     with pytest.raises(SceneError, match=rf"part\.stl.*{words}"):
         build_scene(SceneConfig(object=str(path)))
+
+
+@pytest.mark.parametrize("suffix", ["stl", "ply"])
+def test_a_mesh_is_scaled_and_stays_where_its_file_has_it_if_wanted(tmp_path, suffix):
+    path = tmp_path / f"part.{suffix}"
+    shape = trimesh.creation.box((100, 60, 40), transform=trimesh.transformations.translation_matrix((10, 20, 30)))
+    path.write_bytes(as_bytes(shape.export(file_type=suffix)))
+    scene = build_scene(SceneConfig(object=str(path), mesh_scale=0.001, is_mesh_recentred=False))
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    geom = scene.object_geom_ids[0]
+    vertices = scene.mj_model.mesh_vert @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    np.testing.assert_allclose(vertices.min(axis=0), [-0.04, -0.01, 0.01], atol=1e-6)
+    np.testing.assert_allclose(vertices.max(axis=0), [0.06, 0.05, 0.05], atol=1e-6)
+
+
+def test_a_plane_that_the_arm_could_touch_is_refused(tmp_path):
+    path = tmp_path / "wall.xml"
+    wall = '<mujoco><worldbody><geom name="wall" type="plane" size="1 1 .1" pos="1 0 0" {bits}/></worldbody></mujoco>'
+    path.write_text(wall.format(bits=""))
+    with pytest.raises(SceneError, match=r"geom 'obstacle/wall' .* is a plane.*make it a box"):
+        build_scene(SceneConfig(obstacles=str(path)))
+    path.write_text(wall.format(bits='contype="0" conaffinity="0"'))
+    assert len(build_scene(SceneConfig(obstacles=str(path))).obstacle_geom_ids) == 1
+
+
+def test_a_wrist_camera_that_sees_no_central_square_is_refused(tmp_path):
+    path = tmp_path / "arm.xml"
+    text = (xml_folder() / "arm" / "lwr.xml").read_text()
+    for attributes, is_fine in (
+        ('projection="orthographic"', False),
+        ('focal=".01 .01" sensorsize=".008 .006" resolution="64 48"', False),
+        ('focal=".01 .01" sensorsize=".006 .006" principal=".001 0" resolution="64 64"', False),
+        ('focal=".01 .01" sensorsize=".006 .006" resolution="64 64"', True),
+    ):
+        path.write_text(re.sub(r'(<camera name="wrist"[^>]*?) fovy="[^"]*"', rf"\1 {attributes}", text))
+        if is_fine:
+            assert build_scene(SceneConfig(arm=str(path))).mj_model.ncam
+        else:
+            with pytest.raises(SceneError, match="camera 'wrist' is orthographic or its sensor"):
+                build_scene(SceneConfig(arm=str(path)))
 
 
 def test_a_bad_mesh_and_an_unknown_name_are_told(tmp_path):

@@ -162,10 +162,11 @@ class ViewSearchEnv(Env):
 
     def random_view(self, key: Array) -> tuple[View, Array]:
         """Returns a view, uniform over the band, and random joints f32[nq] to come from."""
-        azimuth_key, elevation_key, joints_key = jax.random.split(key, 3)
-        azimuth = jax.random.uniform(azimuth_key, minval=-jnp.pi, maxval=jnp.pi)
-        elevation = jax.random.uniform(elevation_key, minval=self.reach.band[0], maxval=self.reach.band[1])
-        return View(azimuth, elevation), self.random_joints(joints_key)
+        # One draw of all numbers: each draw takes longer to compile than what is done with it.
+        numbers = jax.random.uniform(key, (2 + self.scene.mj_model.nq,))
+        low, high = self.reach.band
+        view = View(jnp.pi * (2.0 * numbers[0] - 1.0), low + (high - low) * numbers[1])
+        return view, self._joints(numbers[2:])
 
     def nearest_view(self, view: View) -> tuple[View, Array]:
         """Returns the view of the map's reachable cell nearest to `view`, and the cell's joints f32[nq]."""
@@ -174,9 +175,12 @@ class ViewSearchEnv(Env):
 
     def random_joints(self, key: Array) -> Array:
         """Returns f32[nq], the joints that move the camera uniform inside their limits, the others at home."""
+        return self._joints(jax.random.uniform(key, (self.scene.mj_model.nq,)))
+
+    def _joints(self, numbers: Array) -> Array:
         lower, upper = start_limits(self.arm)
         address = self.arm.chain.address
-        joints = lower + (upper - lower) * jax.random.uniform(key, lower.shape)
+        joints = lower + (upper - lower) * numbers
         return self.arm.home.at[address].set(joints[address])
 
     def random_sight(self, key: Array) -> Sight:

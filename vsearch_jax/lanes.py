@@ -28,12 +28,14 @@ class Job(NamedTuple):
       step: (problem, state) -> state; a state that is done must come back unchanged.
       is_done: state -> bool[].
       finish: (problem, state) -> result.
+      has_stragglers: some problems take many more steps than others. Then the last go on alone, compiled apart.
     """
 
     begin: Callable[[Any, Any, Array], Any]
     step: Callable[[Any, Any], Any]
     is_done: Callable[[Any], Array]
     finish: Callable[[Any, Any], Any]
+    has_stragglers: bool = True
 
 
 class _Run(NamedTuple):
@@ -58,7 +60,7 @@ def run(job: Job, problems: Any, order: tuple[Array, Array], states: Any, result
     num_problems, num_lanes = order[0].shape[0], jax.tree.leaves(states)[0].shape[0]
     state = _Run(states, jnp.full(num_lanes, num_problems, jnp.int32), jnp.int32(0), results)
     # When the queue is empty and few are left, these go on alone: all lanes cost the same, idle or not.
-    few = num_lanes // TAIL_SHARE
+    few = num_lanes // TAIL_SHARE if job.has_stragglers else 0
     state = _loop(job, problems, order, state, few)
     if few:
         busy = jnp.argsort(state.held >= num_problems)[:few]

@@ -93,10 +93,10 @@ def check(vertices: np.ndarray, faces: np.ndarray, largest: float) -> MeshReport
     if size > largest:
         raise MeshError(
             f"it is {size:.3g} m long, and {largest:.3g} m can be looked at; "
-            "if its unit is millimetres, scale it by 0.001"
+            "if its unit is millimetres, set SceneConfig.mesh_scale to 0.001"
         )
     if size < _LEAST_SIZE:
-        raise MeshError(f"it is {size:.3g} m long, less than {_LEAST_SIZE} m; meshes are in metres: scale it")
+        raise MeshError(f"it is {size:.3g} m long, less than {_LEAST_SIZE} m; set SceneConfig.mesh_scale")
     return report
 
 

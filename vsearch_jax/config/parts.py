@@ -16,6 +16,10 @@ class SceneConfig:
     """A name in xml/arm, or the path of an MJCF file with a site `tcp` and a camera `wrist`."""
     object: str = "teapot"
     """A name in xml/objects, or the path of an MJCF or mesh file."""
+    mesh_scale: float = 1.0
+    """Metres in the unit of the object's mesh file: 0.001 for millimetres."""
+    is_mesh_recentred: bool = True
+    """Whether the object's mesh is moved over the origin and onto the table; else it stands where its file has it."""
     obstacles: str | None = None
     """What else stands around: a name in xml/obstacles, or the path of an MJCF file in world coordinates."""
     mount_height: float = 1.355
@@ -30,7 +34,7 @@ class SceneConfig:
     """Height and width in pixels of the image that the encoder reads."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "mount_height", "radius", "image_size")
+        require_positive(self, "mount_height", "radius", "image_size", "mesh_scale")
         require_finite(self, "center_height", "table_clearance")
         require(self, "center_height", self.center_height >= 0.0, "0 or more")
         require(self, "table_clearance", self.table_clearance >= 0.0, "0 or more")

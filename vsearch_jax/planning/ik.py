@@ -132,6 +132,7 @@ def _clear(arm: Arm, joints: Array, finite: Array, is_open: Array) -> Array:
         step=step,
         is_done=lambda state: state >= 0,
         finish=lambda _, state: state > 0,
+        has_stragglers=False,
     )
     blank, states = jnp.zeros(is_open.shape, bool), jnp.zeros(min(MOST_LANES, is_open.shape[0]), jnp.int32)
     return lanes.run(job, (joints, finite), lanes.in_order(is_open), states, blank)

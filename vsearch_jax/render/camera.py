@@ -6,6 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax import Array
 from jaxlie import SE3
 
@@ -14,24 +15,43 @@ from vsearch_jax.render.scene import RenderError
 from vsearch_jax.types import Camera
 
 
-def camera(data: Any, mj_model: mujoco.MjModel, name: str) -> Camera:
+def camera(data: Any, mj_model: mujoco.MjModel, name: str, size: tuple[int, int] | None = None) -> Camera:
     """Returns the model's camera `name` where `data` puts it.
 
     Args:
       data: mjx.Data, or anything with cam_xpos f32[ncam, 3] m and cam_xmat f32[ncam, 3, 3], camera to world.
-      mj_model: the model of `data`; gives the field of view.
+      mj_model: the model of `data`; gives the field of view, or the sensor, focal lengths and principal point.
       name: the camera's name.
+      size: height and width in pixels of the images; needed for a camera with a sensor only, whose pixels need not be
+        square nor its axis central.
 
     Raises:
-      RenderError: the model has no camera of that name.
+      RenderError: the model has no camera of that name, it is orthographic, or it has a sensor and no size is given.
     """
     camera_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, name)
     if camera_id < 0:
         names = ", ".join(mj_model.cam(i).name for i in range(mj_model.ncam)) or "none"
         raise RenderError(f"the model has no camera {name!r}; it has: {names}")
+    if mj_model.cam_projection[camera_id] != mujoco.mjtProjection.mjPROJ_PERSPECTIVE:
+        raise RenderError(f"camera {name!r} is orthographic, which cannot be rendered; make it a perspective camera")
     fovy = jnp.deg2rad(jnp.float32(mj_model.cam_fovy[camera_id]))
     rotation = jnp.asarray(data.cam_xmat[camera_id], dtype=jnp.float32).reshape(3, 3)
-    return Camera(position=jnp.asarray(data.cam_xpos[camera_id], dtype=jnp.float32), rotation=rotation, fovy=fovy)
+    position = jnp.asarray(data.cam_xpos[camera_id], dtype=jnp.float32)
+    return Camera(position, rotation, fovy, _intrinsics(mj_model, camera_id, size))
+
+
+def _intrinsics(mj_model: mujoco.MjModel, camera_id: int, size: tuple[int, int] | None) -> Array | None:
+    """Returns f32[4] pixels, or None for a camera without a sensor; see `Camera.intrinsics`."""
+    sensor = mj_model.cam_sensorsize[camera_id]
+    if not sensor[1] > 0.0:
+        return None
+    if size is None:
+        name = mj_model.cam(camera_id).name
+        raise RenderError(f"camera {name!r} has a sensorsize; say for which images: camera(..., size=(height, width))")
+    focal, principal = mj_model.cam_intrinsic[camera_id, :2], mj_model.cam_intrinsic[camera_id, 2:]
+    pixels = np.array([size[1], size[0]]) / sensor
+    center = 0.5 * (np.array([size[1], size[0]]) - 1.0) - principal * pixels
+    return jnp.asarray(np.concatenate([focal * pixels, center]), jnp.float32)
 
 
 def camera_from_pose(T_world_camera: SE3, fovy: Array | float) -> Camera:

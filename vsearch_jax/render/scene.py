@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjtGeom, mjtLightType
+from mujoco import mjtGeom, mjtLightType, mjtObj
 
 from vsearch_jax.render.rays import RAY_FUNCTIONS
 from vsearch_jax.render.textures import Textures, compile_textures, rgb_texture
@@ -121,7 +121,7 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
 
     Raises:
       RenderError: a visible geom is of a type or has a texture that is not supported, a light tracks a body or
-        is an image, or no geom is visible.
+        is an image, the model has a visible skin or flex, or no geom is visible.
     """
     rgba = _shown_rgba(mj_model)
     groups = np.clip(mj_model.geom_group, 0, mujoco.mjNGROUP - 1)
@@ -132,6 +132,7 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
         )
     for geom in visible:
         _check_geom(mj_model, int(geom))
+    _check_soft(mj_model, geom_groups)
     kinds = mj_model.geom_type[visible]
     ids = visible[np.lexsort((kinds, np.isin(kinds, TRIANGLE_TYPES)))]
     lights = _compile_lights(mj_model)
@@ -189,6 +190,21 @@ def _check_geom(model: mujoco.MjModel, geom: int) -> None:
             f"{name} has the texture {model.tex(texture).name!r} of {model.tex_nchannel[texture]} channels, "
             "which cannot be rendered; give it three"
         )
+
+
+def _check_soft(model: mujoco.MjModel, groups: tuple[int, ...]) -> None:
+    for kind, shade, group in (
+        (mjtObj.mjOBJ_SKIN, model.skin_rgba, model.skin_group),
+        (mjtObj.mjOBJ_FLEX, model.flex_rgba, model.flex_group),
+    ):
+        for number in range(len(shade)):
+            if shade[number, 3] > 0.0 and group[number] in groups:
+                name = mujoco.mj_id2name(model, kind, number) or ""
+                word = kind.name.removeprefix("mjOBJ_").lower()
+                raise RenderError(
+                    f"{word} {name!r} (number {number}) cannot be rendered; give it alpha 0 or a group other than "
+                    f"{groups}, or replace it by a mesh"
+                )
 
 
 def _compile_lights(model: mujoco.MjModel) -> Lights:

@@ -1,0 +1,103 @@
+"""Cameras of a model against the frusta of MuJoCo's own renderer, and what the renderer refuses by name."""
+
+from __future__ import annotations
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from vsearch_jax import render
+from vsearch_jax.render.camera import pinhole, pixel_rays
+
+SIZE = (24, 32)
+CAMERAS = """
+<mujoco><worldbody><geom size=".5"/>
+  <camera name="plain" pos="0 0 2" fovy="50"/>
+  <camera name="sensor" pos="0 0 2" focal=".01 .012" sensorsize=".008 .006" principal=".001 .0005" resolution="32 24"/>
+  <camera name="flat" pos="0 0 2" projection="orthographic"/>
+</worldbody></mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def data(model) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def _frustum(model, data, name: str) -> mujoco.MjvGLCamera:
+    scene, camera = mujoco.MjvScene(model, 100), mujoco.MjvCamera()
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(name).id
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
+    return scene.camera[0]
+
+
+def test_a_sensor_is_seen_through_as_mujocos_renderer_does(model, data):
+    camera = render.camera(data, model, "sensor", SIZE)
+    x, y = (np.asarray(axis).ravel() for axis in pixel_rays(pinhole(camera, SIZE), SIZE))
+    frustum = _frustum(model, data, "sensor")
+    near = frustum.frustum_near
+    half = np.array([x[1] - x[0], y[0] - y[1]]) / 2  # the frustum ends at the edges of the outer pixels
+    left = frustum.frustum_center - frustum.frustum_width
+    right = frustum.frustum_center + frustum.frustum_width
+    np.testing.assert_allclose([x[0] - half[0], x[-1] + half[0]], np.array([left, right]) / near, rtol=1e-4)
+    edges = np.array([frustum.frustum_top, frustum.frustum_bottom]) / near
+    np.testing.assert_allclose([y[0] + half[1], y[-1] - half[1]], edges, rtol=1e-4)
+
+
+def test_a_plain_camera_has_its_field_of_view(model, data):
+    camera = render.camera(data, model, "plain")
+    assert camera.intrinsics is None
+    frustum = _frustum(model, data, "plain")
+    assert np.tan(camera.fovy / 2) == pytest.approx(frustum.frustum_top / frustum.frustum_near, rel=1e-5)
+
+
+def test_cameras_that_cannot_be_drawn_are_named(model, data):
+    with pytest.raises(render.RenderError, match="'flat' is orthographic"):
+        render.camera(data, model, "flat")
+    with pytest.raises(render.RenderError, match=r"'sensor' has a sensorsize.*size=\(height, width\)"):
+        render.camera(data, model, "sensor")
+    with pytest.raises(render.RenderError, match="no camera 'other'; it has: plain, sensor, flat"):
+        render.camera(data, model, "other")
+
+
+SOFT = """
+<mujoco><worldbody><geom size=".1"/>
+  <flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2" radius=".01"{look}/>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.parametrize(("look", "is_drawn"), [("", True), (' rgba="1 1 1 0"', False), (' group="4"', False)])
+def test_a_flex_that_would_be_missing_is_refused(look: str, is_drawn: bool):
+    model = mujoco.MjModel.from_xml_string(SOFT.format(look=look))
+    if is_drawn:
+        with pytest.raises(render.RenderError, match=r"flex 'cloth' \(number 0\) cannot be rendered"):
+            render.compile_scene(model)
+    else:
+        assert render.compile_scene(model).geom_ids == (0,)
+
+
+def test_derivatives_of_colour_and_light_equal_finite_differences(model, data):
+    camera, poses = render.camera(data, model, "plain"), render.poses(data)
+    scene = render.compile_scene(model)
+    lit = scene.replace(specular=scene.specular * 0.5, shininess=scene.shininess * 0.1)
+
+    def brightness(change, name):
+        changed = lit.replace(**{name: getattr(lit, name) + change})
+        return render.render(changed, poses, camera, SIZE).rgb.sum()
+
+    for name in ("rgb", "specular", "shininess", "emission", "headlight_diffuse", "headlight_ambient"):
+        step = np.float32(1.0 if name == "shininess" else 1e-2)
+        value = jax.jit(jax.value_and_grad(lambda change, name=name: brightness(change, name)))
+        slope = value(np.float32(0.0))[1]
+        difference = (value(step)[0] - value(-step)[0]) / (2 * step)
+        assert np.abs(difference) > 1e-3, name
+        np.testing.assert_allclose(slope, difference, rtol=2e-2, err_msg=name)

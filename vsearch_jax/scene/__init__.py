@@ -1,0 +1,6 @@
+"""One MuJoCo model out of table, lights, mount, an arm that hangs from the mount, and an object to look at."""
+
+from vsearch_jax.scene.assembly import Scene, build_scene
+from vsearch_jax.scene.files import SceneError, available, xml_folder
+
+__all__ = ["Scene", "SceneError", "available", "build_scene", "xml_folder"]
