@@ -51,6 +51,16 @@ def test_success_means_the_threshold_and_false_positives_are_far_successes(resul
     assert (np.diff(r["best_scores"], axis=-1) >= 0.0).all()
 
 
+@pytest.mark.parametrize("name", ["random_search", "cma_es", "sac"])
+def test_motions_are_counted_and_cost_what_the_speeds_allow(results, name):
+    r = results[name]
+    np.testing.assert_array_equal(r["num_plans"], r["evaluations"] - (name != "sac"))
+    has_moved = r["num_plans"] > r["unreachable"]
+    assert ((r["joint_travel"] > 0.0) == has_moved).all() and ((r["motion_time"] > 0.0) == has_moved).all()
+    # No joint of the LWR turns faster than 180 degrees a second, so seven together cover sqrt(7) times that.
+    assert (r["joint_travel"] <= np.pi * np.sqrt(7) * r["motion_time"] + 1e-4).all()
+
+
 def test_pose_errors_agree_with_the_views(results):
     r = results["random_search"]
     # On a sphere the way between two cameras can't be longer than its diameter, and the thesis's angle is the geodesic.

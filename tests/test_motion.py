@@ -10,7 +10,8 @@ import pytest
 import vsearch_jax as vs
 from vsearch_jax.config import ConfigError, EnvConfig
 from vsearch_jax.geometry import view_pose
-from vsearch_jax.types import View
+from vsearch_jax.planning import duration, straight_duration, time_path
+from vsearch_jax.types import Path, PlanStatus, View
 
 CONFIG = vs.Config.preset("smoke")
 
@@ -60,6 +61,32 @@ def test_dynamics_end_near_the_view(by_joints):
     position, turn = _errors(env, views, sights)
     # The error of IK, 1 mm and 0.1 degrees, and that of the motion.
     assert np.all(position[is_reachable] < 2e-3) and np.all(turn[is_reachable] < np.deg2rad(0.3))
+
+
+def test_a_motion_costs_what_its_timing_says(by_joints):
+    env = _moving(by_joints, reachable="path")
+    views, start = _views(env, 8)
+    _, motions = jax.jit(jax.vmap(lambda view: env.go(view, start)))(views)
+    qpos, _ = jax.jit(jax.vmap(lambda view: env.solve(view, start)))(views)
+    straight = jax.vmap(lambda goal: env.straight(start, goal))(qpos)
+    found = np.asarray(motions.is_found)
+    np.testing.assert_allclose(
+        straight.travel, np.linalg.norm(np.asarray(qpos - start[None])[:, :7], axis=1), rtol=1e-5
+    )
+    # A way round something is longer than the straight one.
+    assert np.all(motions.travel[found] >= straight.travel[found] * 0.999)
+    assert np.all(motions.duration[found] >= straight.duration[found] * 0.97)
+    assert np.all(motions.travel[~found] == 0.0) and np.all(motions.duration[~found] == 0.0)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.1, 0.01])
+def test_straight_motions_last_as_long_as_timed_ones(by_joints, share):
+    arm, config = by_joints.arm, CONFIG.planning
+    goal = arm.home.at[jnp.arange(7)].add(share * jnp.array([0.9, -0.3, 0.4, 0.2, -0.8, 0.1, 0.5]))
+    waypoints = jnp.concatenate([arm.home[None], jnp.repeat(goal[None], config.max_waypoints - 1, axis=0)])
+    path = Path(waypoints, jnp.float32(0.0), jnp.int32(PlanStatus.FOUND))
+    timed = duration(jax.jit(lambda path: time_path(arm, path, config))(path))
+    assert float(straight_duration(arm, arm.home, goal, config)) == pytest.approx(float(timed), rel=0.03)
 
 
 def test_dynamics_without_a_path_are_refused():

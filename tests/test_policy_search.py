@@ -27,12 +27,16 @@ def start_at(view: View, aim: View) -> State:
     sight = Sight(view=view, qpos=jnp.stack([aim.azimuth, aim.elevation]), camera=camera, code=jnp.zeros(1))
     episode = EpisodeState(sight=sight, target=sight, num_steps=jnp.int32(0))
     info, zero = {"is_reachable": jnp.ones(())}, jnp.zeros(())
-    return State(episode, head_for(view, sight.qpos), zero, zero, {"similarity": similarity(view)}, info)
+    return State(episode, head_for(view, sight.qpos), zero, zero, metrics_at(view), info)
 
 
 def head_for(view: View, aim: jax.Array) -> jax.Array:
     way = jnp.stack([wrap_angle(aim[0] - view.azimuth), aim[1] - view.elevation])
     return jnp.clip(way / SCALE, -1.0, 1.0)
+
+
+def metrics_at(view: View) -> dict[str, jax.Array]:
+    return {"similarity": similarity(view), "joint_travel": jnp.float32(0.5), "motion_time": jnp.float32(2.0)}
 
 
 def similarity(view: View) -> jax.Array:
@@ -49,7 +53,7 @@ def step(state: State, action: jax.Array) -> State:
     view = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), view, old)
     episode = episode.replace(sight=episode.sight.replace(view=view), num_steps=episode.num_steps + 1)
     info = {"is_reachable": is_reachable.astype(jnp.float32)}
-    metrics = {"similarity": similarity(view)}
+    metrics = metrics_at(view)
     return state.replace(pipeline_state=episode, obs=head_for(view, episode.sight.qpos), metrics=metrics, info=info)
 
 
@@ -86,6 +90,8 @@ def test_a_policy_that_arrives_is_not_helped(run):
     result = run(starts(), everywhere(TARGET))
     assert (np.asarray(result.score) >= CONFIG.env.threshold).all()
     assert (np.asarray(result.end.num_helped) == 0).all()
+    np.testing.assert_allclose(result.end.travel, 0.5 * np.asarray(result.evaluations))
+    np.testing.assert_allclose(result.end.duration, 2.0 * np.asarray(result.evaluations))
     assert np.asarray(result.evaluations).max() <= 6
 
 

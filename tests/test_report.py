@@ -30,6 +30,9 @@ CONTRACT = {
     "translation_error_cm_mean",
     "false_positive_rate",
     "unreachable_rate",
+    "joint_travel_rad_mean",
+    "motion_time_s_mean",
+    "plans_mean",
 }
 
 
@@ -95,6 +98,14 @@ def test_one_trial_has_no_interval_for_means() -> None:
     raw = {"random_search": one, "cma_es": one, "sac": trials((1, 1), 5)}
     summary = report.results(raw, CONFIG, {})
     assert summary["cma_es"]["evaluations_mean_ci95"] is None
+
+
+def test_an_arm_without_speeds_has_no_times(arrays: dict[str, Any]) -> None:
+    blank = {name: raw | {"motion_time": np.full_like(raw["motion_time"], np.nan)} for name, raw in arrays.items()}
+    summary = report.results(blank, CONFIG, {})
+    assert summary["sac"]["motion_time_s_mean"] is None
+    json.dumps(summary, allow_nan=False)
+    assert dict(rows(summary))["time of the motions, mean (s)"][0].ours == ""
     assert all(len(cells) == 3 for _, cells in rows(summary))
 
 

@@ -18,9 +18,28 @@ from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.execution import execute
 from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
-from vsearch_jax.planning import nearest_cell, reachability_map, rrt_connect, solve_view, start_limits, time_path
+from vsearch_jax.planning import (
+    Motion,
+    duration,
+    nearest_cell,
+    reachability_map,
+    rrt_connect,
+    solve_view,
+    start_limits,
+    straight_duration,
+    time_path,
+)
 from vsearch_jax.scene import SceneError, build_scene
-from vsearch_jax.types import Camera, EncoderState, EpisodeState, Image, PlanStatus, ReachabilityMap, Sight, View
+from vsearch_jax.types import (
+    Camera,
+    EncoderState,
+    EpisodeState,
+    Image,
+    PlanStatus,
+    ReachabilityMap,
+    Sight,
+    View,
+)
 
 _REACH_SEED = 20_191_201
 """Of the starts from which the reachability map is solved: the same map in every run, whatever the run's seed."""
@@ -100,6 +119,7 @@ class ViewSearchEnv(Env):
         zero = jnp.zeros(())
         info = {"terminated": zero, "truncated": zero, "is_reachable": jnp.ones(())}
         metrics = {"similarity": cosine_similarity(sight.code, target.code), "unreachable": zero}
+        metrics |= {"joint_travel": zero, "motion_time": zero}
         return State(
             pipeline_state=episode,  # pyright: ignore[reportArgumentType] # brax lets any pytree stand here
             obs=observe(episode),
@@ -116,7 +136,8 @@ class ViewSearchEnv(Env):
         delta = jnp.clip(action, -1.0, 1.0) * math.radians(task.action_scale_deg)
         old = episode.sight
         view = View(wrap_angle(old.view.azimuth + delta[0]), old.view.elevation + delta[1])
-        moved, is_reachable = self.look(view, old.qpos)
+        moved, motion = self.go(view, old.qpos)
+        is_reachable = motion.is_found
         sight = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), moved, old)
         similarity = cosine_similarity(sight.code, episode.target.code)
         is_found = is_reachable & (similarity >= task.threshold)
@@ -127,12 +148,10 @@ class ViewSearchEnv(Env):
         truncated = (num_steps >= task.episode_length) & ~is_found
         episode = EpisodeState(sight=sight, target=episode.target, num_steps=num_steps)
         reached = is_reachable.astype(jnp.float32)
-        info = state.info | {
-            "terminated": terminated,
-            "truncated": truncated.astype(jnp.float32),
-            "is_reachable": reached,
-        }
-        metrics = state.metrics | {"similarity": similarity, "unreachable": 1.0 - reached}
+        flags = {"terminated": terminated, "truncated": truncated.astype(jnp.float32), "is_reachable": reached}
+        info = state.info | flags
+        costs = {"joint_travel": motion.travel, "motion_time": motion.duration}
+        metrics = state.metrics | {"similarity": similarity, "unreachable": 1.0 - reached} | costs
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
             pipeline_state=episode, obs=observe(episode), reward=reward, done=terminated, metrics=metrics, info=info
         )
@@ -162,7 +181,7 @@ class ViewSearchEnv(Env):
 
     def random_view(self, key: Array) -> tuple[View, Array]:
         """Returns a view, uniform over the band, and random joints f32[nq] to come from."""
-        # One draw of all numbers: each draw takes longer to compile than what is done with it.
+        # One draw: each takes longer to compile than what is done with it.
         numbers = jax.random.uniform(key, (2 + self.scene.mj_model.nq,))
         low, high = self.reach.band
         view = View(jnp.pi * (2.0 * numbers[0] - 1.0), low + (high - low) * numbers[1])
@@ -190,25 +209,39 @@ class ViewSearchEnv(Env):
 
     def look(self, view: View, qpos: Array) -> tuple[Sight, Array]:
         """Returns what is seen from `view` when the arm comes from joints `qpos` (f32[nq]), and bool[] is_reachable."""
-        joints, is_reachable = self.solve(view, qpos)
-        if self.config.env.reachable == "path":
-            joints, is_joined = self.move(qpos, joints)
-            is_reachable = is_reachable & is_joined
-        return self.see(view, joints), is_reachable
+        sight, motion = self.go(view, qpos)
+        return sight, motion.is_found
 
-    def move(self, qpos: Array, goal: Array) -> tuple[Array, Array]:
-        """Returns where the arm stands after it was to go from `qpos` to `goal` (f32[nq] each), and bool[] path found.
+    def go(self, view: View, qpos: Array) -> tuple[Sight, Motion]:
+        """Returns what is seen from `view`, and the motion there from joints `qpos` (f32[nq])."""
+        joints, is_reachable = self.solve(view, qpos)
+        has_path = self.config.env.reachable == "path"
+        joints, motion = self.move(qpos, joints) if has_path else (joints, self.straight(qpos, joints))
+        is_found = is_reachable & motion.is_found
+        costs = (jnp.where(is_found, cost, 0.0) for cost in (motion.travel, motion.duration))
+        return self.see(view, joints), Motion(is_found, *costs)
+
+    def straight(self, qpos: Array, goal: Array) -> Motion:
+        """Returns the straight motion from `qpos` to `goal` (f32[nq] each), whether or not something is in the way."""
+        travel = jnp.linalg.norm((goal - qpos)[self.arm.chain.address])
+        return Motion(jnp.bool_(True), travel, straight_duration(self.arm, qpos, goal, self.config.planning))
+
+    def move(self, qpos: Array, goal: Array) -> tuple[Array, Motion]:
+        """Returns where the arm stands after it was to go from `qpos` to `goal` (f32[nq] each), and the planned motion.
 
         Without a path it stays. In dynamic motion it follows the path and ends where its dynamics lead.
         """
         path = rrt_connect(self.arm, jax.random.key(_PLANNING_SEED), qpos, goal, self.config.planning)
         is_found = path.status == int(PlanStatus.FOUND)
-        if self.config.env.motion == "kinematic":
-            return path.waypoints[-1], is_found
+        if self.arm.without_speed and self.config.env.motion == "kinematic":
+            return path.waypoints[-1], Motion(is_found, path.length, jnp.float32(jnp.nan))
         trajectory = time_path(self.arm, path, self.config.planning)
+        motion = Motion(is_found, path.length, duration(trajectory))
+        if self.config.env.motion == "kinematic":
+            return path.waypoints[-1], motion
         reached = execute(self.arm, self.scene.mjx_model, trajectory, self.config.planning).qpos
         # The limits are soft constraints: the next plan must be able to start from here.
-        return jnp.clip(reached, self.arm.lower, self.arm.upper), is_found
+        return jnp.clip(reached, self.arm.lower, self.arm.upper), motion
 
     def see(self, view: View, qpos: Array) -> Sight:
         """Returns what the wrist camera sees with the arm at joints `qpos` (f32[nq]); `view` is only noted."""

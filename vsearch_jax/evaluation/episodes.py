@@ -61,6 +61,9 @@ def run_episode(episode: tuple[Array, Sight], *, env: ViewSearchEnv, actor: Any,
     last = episode_of(result.end.state)
     return outcome(env.config, result, last.sight.camera, last.target.camera) | {
         "num_helped": result.end.num_helped,
+        "joint_travel": result.end.travel,
+        "motion_time": result.end.duration,
+        "num_plans": result.evaluations,
         "initial_view": first.sight.view,
         "target_view": first.target.view,
         "steps_lower_bound": steps_lower_bound(first.sight.view, first.target, grid, env.reach.band, env.config),

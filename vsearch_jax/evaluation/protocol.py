@@ -33,9 +33,10 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Any]:
       For `random_search` and `cma_es` arrays of [trials] (`num_runs` runs of each initial view, runs fastest), for
       `sac` of [seeds, episodes]: `is_success` bool, `evaluations` i32, `final_cosine` f32, `rotation_error` f32 rad,
       `frobenius_angle` f32 rad, `translation_error` f32 m, `is_false_positive` bool, `unreachable` i32,
-      `best_scores` f32[..., G], `initial_view` and `target_view` View of f32 rad; for `sac` also
-      `steps_lower_bound` i32, fewer steps than which no policy needs, and `num_helped` i32, steps that were not the
-      policy's.
+      `best_scores` f32[..., G], `joint_travel` f32 rad and `motion_time` f32 s of all motions together, `num_plans`
+      i32, how many motions were asked for, one an image but that of the initial view; `initial_view` and `target_view`
+      View of f32 rad; for `sac` also `steps_lower_bound` i32, fewer steps than which no policy needs, and `num_helped`
+      i32, steps that were not the policy's.
 
     Raises:
       ConfigError: the arm can't reach the target view, or nothing at every azimuth.
@@ -76,9 +77,9 @@ def _evaluate(state: TrainState, config: Config) -> dict[str, Any]:
     results = search_trials(jnp.stack([random_search_key, cma_es_key]), env, methods, starts, target)
     target_views = jax.tree.map(lambda x: jnp.broadcast_to(x, starts[1].shape), target.view)
     outcomes: dict[str, Any] = {}
-    for name, (result, camera) in zip(("random_search", "cma_es"), results, strict=True):
+    for name, (result, motions, camera) in zip(("random_search", "cma_es"), results, strict=True):
         measured = jax.vmap(outcome, in_axes=(None, 0, 0, None))(config, result, camera, target.camera)
-        outcomes[name] = measured | {"initial_view": initial.view, "target_view": target_views}
+        outcomes[name] = measured | motions | {"initial_view": initial.view, "target_view": target_views}
     return outcomes | {"sac": evaluate_policies(env, state, (search_keys, ends), grid)}
 
 

@@ -12,6 +12,7 @@ from jax import Array
 from vsearch_jax.env import ViewSearchEnv
 from vsearch_jax.evaluation.views import map_batched
 from vsearch_jax.geometry import cosine_similarity
+from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
 from vsearch_jax.search.common import is_running, to_result
 from vsearch_jax.types import Camera, SearchResult, Sight, View
@@ -23,15 +24,19 @@ class _Trial(NamedTuple):
     Attributes:
       states: of all searchers, of which only the one's that is running changes.
       camera: where the arm saw the best view.
+      qpos: f32[nq] rad or m, where the arm stands.
+      costs: f32[2], travel in rad and duration in s of the motions so far.
     """
 
     states: tuple[Any, ...]
     camera: Camera
+    qpos: Array
+    costs: Array
 
 
 def search_trials(
     keys: Array, env: ViewSearchEnv, methods: tuple[Method, ...], starts: tuple[Sight, Array], target: Sight
-) -> list[tuple[SearchResult, Camera]]:
+) -> list[tuple[SearchResult, dict[str, Array], Camera]]:
     """Runs every searcher from each of `starts`, one searcher after the other.
 
     All take their images in one place: taking images is what is long to compile.
@@ -44,7 +49,8 @@ def search_trials(
       target: Sight of the target.
 
     Returns:
-      For each searcher its results and the cameras at their views, leading axis N.
+      For each searcher its results, what its motions cost (`joint_travel` f32 rad, `motion_time` f32 s, `num_plans`
+      i32) and the cameras at the views found, leading axis N.
     """
     num_views = max(method.num_views for method in methods)
     batch_size = max(1, env.config.evaluation.batch_size // num_views)
@@ -57,8 +63,12 @@ def search_trials(
     trials = jax.lax.map(searcher, (jnp.arange(len(methods)), keys))
     results = []
     for number, method in enumerate(methods):
-        states, camera = jax.tree.map(lambda x, n=number: x[n], (trials.states[number], trials.camera))
-        results.append((jax.vmap(to_result)(method.record(states)), camera))
+        own = (trials.states[number], trials.camera, trials.costs)
+        states, camera, costs = jax.tree.map(lambda x, n=number: x[n], own)
+        result = jax.vmap(to_result)(method.record(states))
+        # The image of the initial view needs no motion.
+        motions = {"joint_travel": costs[:, 0], "motion_time": costs[:, 1], "num_plans": result.evaluations - 1}
+        results.append((result, motions, camera))
     return results
 
 
@@ -71,7 +81,7 @@ def _trial(
 ) -> _Trial:
     key, (start, score) = item
     args = SearchArgs(
-        initial=start.view, band=env.reach.band, threshold=jnp.asarray(env.config.env.threshold), task=start.qpos
+        initial=start.view, band=env.reach.band, threshold=jnp.asarray(env.config.env.threshold), task=None
     )
     states = tuple(method.start(args, score) for method in methods)
     body = functools.partial(_generation, env, methods, (number, key), target, args)
@@ -80,7 +90,7 @@ def _trial(
         records = [method.record(state) for method, state in zip(methods, trial.states, strict=True)]
         return jnp.stack([is_running(record, args.threshold) for record in records])[number]
 
-    return jax.lax.while_loop(goes_on, body, _Trial(states, start.camera))
+    return jax.lax.while_loop(goes_on, body, _Trial(states, start.camera, start.qpos, jnp.zeros(2)))
 
 
 def _generation(
@@ -107,9 +117,41 @@ def _generation(
 
     numbers = range(len(methods))
     views, states = jax.lax.switch(number, [functools.partial(ask, i) for i in numbers], trial.states)
-    sights, is_reachable = jax.vmap(env.look, in_axes=(0, None))(views, args.task)
+    sights, motions = _go_round(env, trial.qpos, views)
     similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(sights.code, target.code)
-    scores = jnp.where(is_reachable, similarity, -jnp.inf)
+    scores = jnp.where(motions.is_found, similarity, -jnp.inf)
+    is_hit = (scores >= args.threshold).astype(jnp.int32)
+    is_moved = motions.is_found & (jnp.cumsum(is_hit) - is_hit == 0)  # not after the view that ends the search
+    qpos, costs = _follow(env, trial, sights.qpos, motions._replace(is_found=is_moved))
     states, best = jax.lax.switch(number, [functools.partial(tell, i) for i in numbers], states, views, scores)
     camera = jax.tree.map(lambda new, old: jnp.where(best >= 0, new[best], old), sights.camera, trial.camera)
-    return _Trial(states, camera)
+    return _Trial(states, camera, qpos, costs)
+
+
+def _go_round(env: ViewSearchEnv, qpos: Array, views: View) -> tuple[Sight, Motion]:
+    """Returns what is seen from `views` (f32[N] rad), taken one after the other from joints `qpos`, and the motions."""
+    if env.config.env.reachable == "ik":
+        return jax.vmap(env.go, in_axes=(0, None))(views, qpos)
+
+    def go_on(here: Array, view: View) -> tuple[Array, tuple[Sight, Motion]]:
+        sight, motion = env.go(view, here)
+        return jnp.where(motion.is_found, sight.qpos, here), (sight, motion)
+
+    return jax.lax.scan(go_on, qpos, views)[1]
+
+
+def _follow(env: ViewSearchEnv, trial: _Trial, joints: Array, motions: Motion) -> tuple[Array, Array]:
+    """Returns where the arm stands after the motions to `joints` (f32[N, nq]) that are found, and all costs so far.
+
+    Without paths the views of a generation are looked at from one place, all at once, so here each way is measured
+    anew from the view before.
+    """
+
+    def add(done: tuple[Array, Array], step: tuple[Array, Motion]) -> tuple[tuple[Array, Array], None]:
+        (here, costs), (there, motion) = done, step
+        if env.config.env.reachable == "ik":
+            motion = env.straight(here, there)._replace(is_found=motion.is_found)
+        cost = jnp.stack([motion.travel, motion.duration])
+        return (jnp.where(motion.is_found, there, here), costs + jnp.where(motion.is_found, cost, 0.0)), None
+
+    return jax.lax.scan(add, (trial.qpos, trial.costs), (joints, motions))[0]

@@ -5,9 +5,10 @@ from vsearch_jax.planning.ik import ik
 from vsearch_jax.planning.reachability import nearest_cell, reachability_map, solve_view
 from vsearch_jax.planning.rrt import rrt, rrt_connect
 from vsearch_jax.planning.starts import ik_from_starts, start_limits
-from vsearch_jax.planning.trajectory import PlanningError, duration, sample, time_path
+from vsearch_jax.planning.trajectory import Motion, PlanningError, duration, sample, straight_duration, time_path
 
 __all__ = [
+    "Motion",
     "PlanningError",
     "duration",
     "edge_is_free",
@@ -20,5 +21,6 @@ __all__ = [
     "sample",
     "solve_view",
     "start_limits",
+    "straight_duration",
     "time_path",
 ]

@@ -7,6 +7,7 @@ of each joint's acceleration kept for the bends, so that both passes are running
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,20 @@ TINY = 1e-6
 
 class PlanningError(ValueError):
     """A motion cannot be timed; the message names the joints and the remedy."""
+
+
+class Motion(NamedTuple):
+    """What a motion of the arm costs.
+
+    Attributes:
+      is_found: bool[]; else the arm stays, and the rest is 0.
+      travel: f32[] rad, way in joint space (m of slides count alike).
+      duration: f32[] s, from rest to rest within the limits; NaN for an arm whose model gives no speeds.
+    """
+
+    is_found: Array
+    travel: Array
+    duration: Array
 
 
 def time_path(arm: Arm, path: Path, config: PlanningConfig) -> Trajectory:
@@ -66,6 +81,22 @@ def time_path(arm: Arm, path: Path, config: PlanningConfig) -> Trajectory:
     durations = jnp.where(sizes > 0.0, 2.0 * sizes / jnp.maximum(speed[:-1] + speed[1:], 1e-9), 0.0)
     times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(durations)])
     return blank._replace(sizes=sizes, times=times, squared_speeds=squared)
+
+
+def straight_duration(arm: Arm, start: Array, goal: Array, config: PlanningConfig) -> Array:
+    """Returns f32[] s: how long the straight motion takes from rest to rest, as `time_path` times it.
+
+    Args:
+      arm: the arm; NaN comes back where a joint of the chain has no speed limit.
+      start: f32[nq] rad or m.
+      goal: f32[nq] rad or m.
+      config: the acceleration time.
+    """
+    address = arm.chain.address
+    at_full_speed = jnp.max(jnp.abs(goal - start)[address] / arm.speed[address])
+    ramp = config.acceleration_time
+    # Short motions turn from speeding up to slowing down before they are at full speed.
+    return jnp.where(at_full_speed > ramp, at_full_speed + ramp, 2.0 * jnp.sqrt(at_full_speed * ramp))
 
 
 def duration(trajectory: Trajectory) -> Array:

@@ -74,6 +74,9 @@ def summarize(trials: Mapping[str, Any]) -> dict[str, Any]:
         **_mean("frobenius_angle_deg_mean", np.rad2deg(trials["frobenius_angle"])),
         **_mean("translation_error_cm_mean", 100.0 * trials["translation_error"]),
         **_rate("false_positive_rate", trials["is_false_positive"].sum(), evaluations.size),
+        **_mean("joint_travel_rad_mean", trials["joint_travel"]),
+        **_mean("motion_time_s_mean", trials["motion_time"]),
+        **_mean("plans_mean", trials["num_plans"]),
         **_rate("unreachable_rate", trials["unreachable"].sum(), evaluations.sum()),
     }
     if "steps_lower_bound" in trials:
@@ -91,8 +94,10 @@ def _rate(name: str, count: Any, total: Any) -> dict[str, Any]:
 
 
 def _mean(name: str, values: np.ndarray) -> dict[str, Any]:
-    """Returns a mean with the bootstrap's percentile interval; no interval where there is one value only."""
+    """Returns a mean with the bootstrap's percentile interval; none where there is one value, no mean with NaN."""
     values = np.asarray(values, np.float64)
+    if np.isnan(values).any():  # an arm without speed limits has no times
+        return {name: None, f"{name}_ci95": None}
     interval = None
     if values.size > 1:
         # The same resamples in each run, so that the report of a run does not change when it is made again.

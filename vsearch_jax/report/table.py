@@ -45,6 +45,9 @@ MEASURES = (
     Measure("translation_error_cm_mean", "translational error, mean (cm)", digits=2),
     Measure("false_positive_rate", "false positives (%)", 100.0, 2),
     Measure("unreachable_rate", "unreachable (%)", 100.0, 2),
+    Measure("joint_travel_rad_mean", "joint travel, mean (rad)", digits=1),
+    Measure("motion_time_s_mean", "time of the motions, mean (s)", digits=1),
+    Measure("plans_mean", "motions planned, mean", digits=2),
     Measure("helped_rate", "episodes with steps of help (%)", 100.0, 2),
     Measure("environment_steps", "environment steps of training", digits=0),
 )

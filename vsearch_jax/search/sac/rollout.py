@@ -59,10 +59,14 @@ class PolicyEnd(NamedTuple):
     Attributes:
       state: brax State at the end of the episode.
       num_helped: i32[], steps that were not the policy's.
+      travel: f32[] rad, sum of the steps' metric `joint_travel`.
+      duration: f32[] s, sum of `motion_time`.
     """
 
     state: State
     num_helped: Array
+    travel: Array
+    duration: Array
 
 
 @flax.struct.dataclass
@@ -74,12 +78,14 @@ class _Carry:
       state: brax State.
       num_helped: i32[], steps that were not the policy's.
       num_around: i32[], those of them around the best view, since that has come nearer.
+      costs: f32[2], travel in rad and duration in s of the motions so far.
     """
 
     record: Record
     state: State
     num_helped: Array
     num_around: Array
+    costs: Array
 
 
 def search(key: Array, step_fn: StepFn, args: SearchArgs, config: Config) -> SearchResult:
@@ -111,10 +117,10 @@ def search(key: Array, step_fn: StepFn, args: SearchArgs, config: Config) -> Sea
     start: State = args.task.start
     record = start_record(args.initial, jnp.asarray(-jnp.inf, jnp.float32), config.env.episode_length)
     record = dataclasses.replace(record, evaluations=jnp.int32(0), unreachable=jnp.int32(0))
-    carry = _Carry(record=record, state=start, num_helped=jnp.int32(0), num_around=jnp.int32(0))
+    carry = _Carry(record=record, state=start, num_helped=jnp.int32(0), num_around=jnp.int32(0), costs=jnp.zeros(2))
     body = functools.partial(_step, key, step_fn, args, config)
     carry = jax.lax.while_loop(lambda carry: is_running(carry.record, args.threshold), body, carry)
-    result, end = to_result(carry.record), PolicyEnd(carry.state, carry.num_helped)
+    result, end = to_result(carry.record), PolicyEnd(carry.state, carry.num_helped, *carry.costs)
     return dataclasses.replace(result, view=_view(end.state), score=end.state.metrics["similarity"], end=end)
 
 
@@ -139,6 +145,7 @@ def _step(key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: 
         state=state,
         num_helped=carry.num_helped + is_helped.astype(jnp.int32),
         num_around=num_around + (is_helped & is_near).astype(jnp.int32),
+        costs=carry.costs + jnp.stack([state.metrics["joint_travel"], state.metrics["motion_time"]]),
     )
 
 
