@@ -103,6 +103,8 @@ def test_paths_are_made_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         ("train --out {out} --resume", "no run in"),
         ("eval {out}", "no run in .*config.json is missing"),
         ("export {out} --out {out}2", "no run in"),
+        ("reach --out {out} --radius -1", "SceneConfig.radius is -1"),
+        ("reach --out {out} --mesh-scale 0", "SceneConfig.mesh_scale is 0"),
     ],
 )
 def test_a_users_error_is_one_line_and_makes_nothing(

@@ -1,6 +1,7 @@
 """How the environment moves: by joints set, along a planned path, or by the arm's dynamics."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import vsearch_jax as vs
 from vsearch_jax.config import ConfigError, EnvConfig
 from vsearch_jax.geometry import view_pose
 from vsearch_jax.planning import duration, straight_duration, time_path
+from vsearch_jax.scene import SceneError, xml_folder
 from vsearch_jax.types import Path, PlanStatus, View
 
 CONFIG = vs.Config.preset("smoke")
@@ -87,6 +89,16 @@ def test_straight_motions_last_as_long_as_timed_ones(by_joints, share):
     path = Path(waypoints, jnp.float32(0.0), jnp.int32(PlanStatus.FOUND))
     timed = duration(jax.jit(lambda path: time_path(arm, path, config))(path))
     assert float(straight_duration(arm, arm.home, goal, config)) == pytest.approx(float(timed), rel=0.03)
+
+
+def test_dynamics_without_actuators_are_refused(tmp_path):
+    path = tmp_path / "arm.xml"
+    text = (xml_folder() / "arm" / "lwr.xml").read_text()
+    path.write_text(re.sub(r'<position [^>]*joint="A3"[^>]*/>', "", text))
+    scene = dataclasses.replace(CONFIG.scene, arm=str(path))
+    motion = dataclasses.replace(CONFIG.env, reachable="path", motion="dynamic")
+    with pytest.raises(SceneError, match=r"joint arm/A3 has no position actuator"):
+        vs.ViewSearchEnv(dataclasses.replace(CONFIG, scene=scene, env=motion))
 
 
 def test_dynamics_without_a_path_are_refused():

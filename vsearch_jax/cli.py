@@ -12,91 +12,21 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Union
 
 import tyro
 from rich.console import Console
 
-from vsearch_jax.config import PRESETS, Config
+from vsearch_jax.commands import DEFAULT_PRESET, Command, Eval, Export, Reach, Train
+from vsearch_jax.config import Config, SceneConfig
 from vsearch_jax.run_folder import RunError, claim, held, read_config, read_seed
 
-DEFAULT_PRESET = "cpu"
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it: 128 + SIGINT."""
 
 
 class UsageError(ValueError):
     """The command line can't be understood."""
-
-
-def _option(metavar: str, default: str) -> Any:
-    """Returns what --help shows of an option whose default comes from elsewhere."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
-
-
-_Preset = Annotated[str | None, _option("{" + ",".join(PRESETS) + "}", DEFAULT_PRESET)]
-_Name = Annotated[str | None, _option("NAME|PATH", "as below")]
-_Input = Annotated[Literal["rgb", "depth", "silhouette"] | None, _option("{rgb,depth,silhouette}", "as below")]
-
-
-@dataclasses.dataclass(frozen=True)
-class Train:
-    """Trains encoder and policies, evaluates every searcher and writes a report, all into one new folder."""
-
-    out: Path
-    """Folder of the run; it must not exist, or hold nothing, unless --resume is given."""
-    preset: _Preset = None
-    """Where every value below starts from."""
-    seed: Annotated[int | None, _option("INT", "0")] = None
-    """Of all random numbers of the run."""
-    object: _Name = None
-    """Short for --scene.object: a name (see xml/objects) or the path of an MJCF or mesh file."""
-    arm: _Name = None
-    """Short for --scene.arm: a name (see xml/arm) or the path of an MJCF file."""
-    input: _Input = None
-    """Short for --encoder.input."""
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Go on with the run in --out from its last checkpoint, with its config."""
-    config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
-
-
-@dataclasses.dataclass(frozen=True)
-class Eval:
-    """Evaluates a finished run again and writes its results, figures and report anew."""
-
-    run: tyro.conf.Positional[Path]
-    """Folder that `vsearch train` made."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Export:
-    """Writes encoder and policy of a finished run as StableHLO files that run without this package."""
-
-    run: tyro.conf.Positional[Path]
-    """Folder that `vsearch train` made."""
-    out: Path
-    """Folder of the files; it must not exist, or hold nothing."""
-    seed: int = 0
-    """Which of the run's policies."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Reach:
-    """Draws which views an arm reaches, and proposes the mount height that best covers a wanted band."""
-
-    out: Path
-    """Folder of the pictures; it must not exist, or hold nothing."""
-    object: str = "teapot"
-    """A name (see xml/objects) or the path of a file."""
-    arm: str = "lwr"
-    """A name (see xml/arm) or the path of an MJCF file."""
-    band: tuple[float, float] = (40.0, 70.0)
-    """Lowest and highest elevation wanted, in degrees."""
-    heights: tuple[float, float, float] = (0.8, 1.6, 0.05)
-    """Lowest and highest mount height to try, and the step between, in m."""
-
-
-Command = Train | Eval | Export | Reach
 
 
 def parse(arguments: Sequence[str]) -> Command:
@@ -241,7 +171,14 @@ def run_reach(command: Reach) -> None:
     _import_runner()
     from vsearch_jax.reach import draw_reach
 
-    scene = dataclasses.replace(Config().scene, arm=_absolute(command.arm), object=_absolute(command.object))
+    scene = SceneConfig(
+        arm=_absolute(command.arm),
+        object=_absolute(command.object),
+        obstacles=None if command.obstacles is None else _absolute(command.obstacles),
+        radius=command.radius,
+        center_height=command.center_height,
+        mesh_scale=command.mesh_scale,
+    )
     claim(command.out)
     with Console().status("mapping what the arm reaches"):
         message = draw_reach(command.out, scene, command.band, command.heights)

@@ -16,7 +16,7 @@ from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import Config, ConfigError
-from vsearch_jax.execution import execute
+from vsearch_jax.execution import check_actuators, execute
 from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
 from vsearch_jax.planning import (
     Motion,
@@ -80,6 +80,8 @@ class ViewSearchEnv(Env):
         self.scene = build_scene(self.config.scene)
         self.center = jnp.asarray(self.scene.center, jnp.float32)
         self.arm = build_arm(self.scene)
+        if self.config.env.motion == "dynamic":
+            check_actuators(self.scene)
         self.render_scene = render.compile_scene(self.scene.mj_model)
         if not set(self.scene.object_geom_ids) & set(self.render_scene.geom_ids):
             raise SceneError(f"object {self.config.scene.object!r} has no visible geom in the groups 0 to 2")

@@ -6,12 +6,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 from jax import Array
 from mujoco import mjx
 
 from vsearch_jax.arm import Arm
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning import duration, sample
+from vsearch_jax.scene import Scene, SceneError
 from vsearch_jax.types import Trajectory
 
 
@@ -29,6 +32,25 @@ class Execution(NamedTuple):
     peak_torque: Array
     energy: Array
     time: Array
+
+
+def check_actuators(scene: Scene) -> None:
+    """Checks that each joint that moves the camera can be driven.
+
+    Raises:
+      SceneError: a joint has no position actuator of its own.
+    """
+    model = scene.mj_model
+    is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    gain = model.actuator_gainprm[:, 0]
+    is_position = (gain > 0.0) & np.isclose(model.actuator_biasprm[:, 1], -gain)
+    driven = set(model.actuator_trnid[is_joint & is_position, 0].tolist())
+    missing = ", ".join(model.joint(joint).name for joint in scene.joint_ids if joint not in driven)
+    if missing:
+        raise SceneError(
+            f"joint {missing} has no position actuator, which EnvConfig.motion 'dynamic' needs; add "
+            "<position joint=... kp=... kv=.../> to the arm's file, or choose motion 'kinematic'"
+        )
 
 
 def execute(arm: Arm, model: mjx.Model, trajectory: Trajectory, config: PlanningConfig) -> Execution:
