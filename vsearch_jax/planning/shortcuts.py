@@ -90,10 +90,10 @@ def _propose(arm: Arm, problem: Crooked, state: Shortcut) -> Shortcut:
     """Takes the shortcut that saves most of some random ones; one that is not worth trying counts as blocked."""
     lengths = jnp.linalg.norm(jnp.diff(state.waypoints, axis=0), axis=-1)
     ends = jnp.cumsum(lengths)
-    key = jax.random.fold_in(problem.key, state.attempts)
-    places = jax.random.uniform(key, (NUM_CANDIDATES, 2)) * ends[-1]
+    place_key, corner_key = jax.random.split(jax.random.fold_in(problem.key, state.attempts))
+    places = jax.random.uniform(place_key, (NUM_CANDIDATES, 2)) * ends[-1]
     # Half of them start at a waypoint: those are what a path has too many of.
-    corners = ends[jax.random.randint(key, (NUM_CANDIDATES // 2,), 0, jnp.maximum(state.num_points - 2, 1))]
+    corners = ends[jax.random.randint(corner_key, (NUM_CANDIDATES // 2,), 0, jnp.maximum(state.num_points - 2, 1))]
     places = jnp.sort(places.at[: NUM_CANDIDATES // 2, 0].set(corners), axis=1)
     segment = jnp.minimum(jnp.searchsorted(ends, places), state.num_points - 2).astype(jnp.int32)
     length = jnp.maximum(lengths[segment], 1e-9)
