@@ -67,6 +67,11 @@ def search_problems(initial: View, target: View) -> SearchArgs:
     )
 
 
+def no_motion() -> dict[str, Array]:
+    """The metrics of an arm that is everywhere at once."""
+    return {"joint_travel": jnp.zeros(()), "motion_time": jnp.zeros(())}
+
+
 class SphereEnv(Env):
     """View search with codes whose cosine is a product of two known kernels, so that the steps needed are known.
 
@@ -125,7 +130,7 @@ class SphereEnv(Env):
     def start(self, sight: Sight, target: Sight) -> State:
         zero = jnp.zeros(())
         info = {"terminated": zero, "truncated": zero, "is_reachable": jnp.ones(())}
-        metrics = {"similarity": cosine_similarity(sight.code, target.code)}
+        metrics = {"similarity": cosine_similarity(sight.code, target.code)} | no_motion()
         episode = EpisodeState(sight=sight, target=target, num_steps=jnp.zeros((), jnp.int32))
         return State(episode, self.observe(episode), zero, zero, metrics, info)
 
@@ -150,7 +155,9 @@ class SphereEnv(Env):
             "is_reachable": is_reachable.astype(jnp.float32),
         }
         episode = EpisodeState(sight=sight, target=episode.target, num_steps=num_steps)
-        return State(episode, self.observe(episode), reward, info["terminated"], {"similarity": similarity}, info)
+        return State(
+            episode, self.observe(episode), reward, info["terminated"], {"similarity": similarity} | no_motion(), info
+        )
 
     def steps_lower_bound(self, initial: View, target: View) -> Array:
         azimuth_width, elevation_width = self.basin()

@@ -34,10 +34,19 @@ def _views(env: vs.ViewSearchEnv, count: int):
     return views, env.reach.qpos[0, int(np.argmax(np.asarray(env.reach.is_reachable[0])))]
 
 
-def _looks(env: vs.ViewSearchEnv, count: int):
-    views, start = _views(env, count)
-    sights, is_reachable = jax.jit(jax.vmap(lambda view: env.look(view, start)))(views)
-    return views, sights, np.asarray(is_reachable)
+@pytest.fixture(scope="module")
+def by_path(by_joints):
+    """Sights and motions of eight views, along paths."""
+    env = _moving(by_joints, reachable="path")
+    views, start = _views(env, 8)
+    return jax.jit(jax.vmap(lambda view: env.go(view, start)))(views)
+
+
+@pytest.fixture(scope="module")
+def solved(by_joints):
+    """Joints of the same views by inverse kinematics, and whether they are reachable."""
+    views, start = _views(by_joints, 8)
+    return jax.jit(jax.vmap(lambda view: by_joints.solve(view, start)))(views)
 
 
 def _errors(env: vs.ViewSearchEnv, views: View, sights) -> tuple[np.ndarray, np.ndarray]:
@@ -47,30 +56,28 @@ def _errors(env: vs.ViewSearchEnv, views: View, sights) -> tuple[np.ndarray, np.
     return position, np.arccos(np.clip((cosine - 1) / 2, -1, 1))
 
 
-def test_a_path_leads_where_kinematics_alone_does(by_joints):
-    views, start = _views(by_joints, 8)
-    qpos, first = jax.jit(jax.vmap(lambda view: by_joints.solve(view, start)))(views)
-    _, by_path, second = _looks(_moving(by_joints, reachable="path"), 8)
+def test_a_path_leads_where_kinematics_alone_does(by_path, solved):
+    (qpos, first), second = solved, np.asarray(by_path[1].is_found)
     assert not np.any(second & ~np.asarray(first))
     assert second.sum() >= 7
-    np.testing.assert_allclose(by_path.qpos[second], qpos[second], atol=1e-5)
+    np.testing.assert_allclose(by_path[0].qpos[second], qpos[second], atol=1e-5)
 
 
 @pytest.mark.slow
 def test_dynamics_end_near_the_view(by_joints):
     env = _moving(by_joints, reachable="path", motion="dynamic")
-    views, sights, is_reachable = _looks(env, 4)
+    views, start = _views(env, 4)
+    sights, is_reachable = jax.jit(jax.vmap(lambda view: env.look(view, start)))(views)
+    is_reachable = np.asarray(is_reachable)
     position, turn = _errors(env, views, sights)
     # The error of IK, 1 mm and 0.1 degrees, and that of the motion.
     assert np.all(position[is_reachable] < 2e-3) and np.all(turn[is_reachable] < np.deg2rad(0.3))
 
 
-def test_a_motion_costs_what_its_timing_says(by_joints):
-    env = _moving(by_joints, reachable="path")
-    views, start = _views(env, 8)
-    _, motions = jax.jit(jax.vmap(lambda view: env.go(view, start)))(views)
-    qpos, _ = jax.jit(jax.vmap(lambda view: env.solve(view, start)))(views)
-    straight = jax.vmap(lambda goal: env.straight(start, goal))(qpos)
+def test_a_motion_costs_what_its_timing_says(by_joints, by_path, solved):
+    (_, motions), (qpos, _) = by_path, solved
+    _, start = _views(by_joints, 8)
+    straight = jax.vmap(lambda goal: by_joints.straight(start, goal))(qpos)
     found = np.asarray(motions.is_found)
     np.testing.assert_allclose(
         straight.travel, np.linalg.norm(np.asarray(qpos - start[None])[:, :7], axis=1), rtol=1e-5
