@@ -166,10 +166,12 @@ def training_example(key: Array, *, env: ViewSearchEnv) -> tuple[Array, Array]:
     return inputs, targets
 
 
-def finish_encoder(_: Array, state: TrainState, *, config: Config) -> TrainState:
+def finish_encoder(index: Array, state: TrainState, *, config: Config) -> TrainState:
     """Fills the pool with random views, fits the whitening on them and starts the training environments from them."""
     env = ViewSearchEnv(config, state.encoder, state.reach)
-    keys = jax.random.split(jax.random.fold_in(state.key, _POOL), config.encoder.pool_size)
+    # `index` is 0. Without it nothing here would change from one iteration to the next, and XLA would move all of it
+    # out of the loop, to be done in each chunk.
+    keys = jax.random.split(jax.random.fold_in(state.key, _POOL + index), config.encoder.pool_size)
     pool, raw = jax.lax.map(functools.partial(_raw_sight, env), keys, batch_size=_POOL_BATCH)
     mean, whitening = encoders.fit_whitening(raw, config.encoder.whitening_power)
     encoder = state.encoder.replace(latent_mean=mean, whitening=whitening)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
