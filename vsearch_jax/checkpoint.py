@@ -154,12 +154,11 @@ def _one_error() -> Iterator[None]:
     for log in logs:
         log.setLevel(logging.CRITICAL)
     sys.unraisablehook = lambda report: None if str(report.exc_value) == "Event loop is closed" else hook(report)
-    try:
-        yield
-    finally:
-        for log, level in zip(logs, levels, strict=True):
-            log.setLevel(level)
-        sys.unraisablehook = hook
+    yield
+    # After an error both stay: the last of those threads may end, and its traceback come, long after this block.
+    sys.unraisablehook = hook
+    for log, level in zip(logs, levels, strict=True):
+        log.setLevel(level)
 
 
 def _check_stored_arrays(folder: Path) -> None:

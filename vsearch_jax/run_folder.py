@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -51,8 +52,17 @@ def claimed(run: Path) -> Iterator[None]:
         yield
     except BaseException:
         (run / CONFIG).unlink(missing_ok=True)
-        shutil.rmtree(run / CHECKPOINTS, ignore_errors=True)
+        _remove(run / CHECKPOINTS)
         raise
+
+
+def _remove(folder: Path) -> None:
+    # A save that failed on one array may still write others, and may make the folder anew to do so.
+    for _ in range(40):
+        shutil.rmtree(folder, ignore_errors=True)
+        time.sleep(0.05)
+        if not folder.exists():
+            return
 
 
 @contextlib.contextmanager
