@@ -22,14 +22,7 @@ hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=No
 hypothesis.settings.load_profile("repeatable")
 
 # Files that take minutes, each on one worker: they start first, so that none is left alone at the end.
-LONG = (
-    "test_training.py",
-    "test_brax_trainer.py",
-    "test_evaluation.py",
-    "test_ik.py",
-    "test_planning.py",
-    "test_cli.py",
-)
+LONG = ("test_training.py", "test_evaluation.py", "test_ik.py", "test_planning.py", "test_cli.py")
 JAX_VERSION = tuple(int(part) for part in jax.__version__.split(".")[:2])
 
 

@@ -11,7 +11,7 @@ import vsearch_jax as vs
 CONFIG = vs.Config.preset("smoke")
 
 
-@pytest.mark.slow  # brax compiles the environment five times
+@pytest.mark.slow  # brax compiles the environment for each of its programs: minutes
 @pytest.mark.brax_trainer
 @pytest.mark.filterwarnings("ignore:jax.device_put_replicated is deprecated:DeprecationWarning")
 def test_braxs_own_sac_trains_on_it():

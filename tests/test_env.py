@@ -102,7 +102,7 @@ def test_a_step_moves_by_the_scaled_action_and_pays_cosine_less_one(env, reset, 
 def test_an_unreachable_view_costs_two_and_the_arm_stays(env, reset, step):
     state = reset(jax.random.key(4))
     low = View(state.pipeline_state.sight.view.azimuth, env.reach.band[0])
-    state = env.start(env.look(low, state.pipeline_state.sight.qpos)[0], state.pipeline_state.target)
+    state = env.start(env.go(low, state.pipeline_state.sight.qpos)[0], state.pipeline_state.target)
     after = step(state, jnp.array([0.0, -1.0]))
     assert after.info["is_reachable"] == 0.0
     assert after.reward == -2.0
@@ -135,7 +135,7 @@ def test_an_episode_is_truncated_after_its_last_step_and_that_is_not_done(reset,
 
 
 def test_brax_wrappers_run_it(env, as_brax_computes):
-    # Of silhouettes, which compile in half the time of colours.
+    # Of silhouettes: without light there is less to compile.
     config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, input="silhouette"))
     wrapped = wrap(vs.ViewSearchEnv(config, reach=env.reach), episode_length=3)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))

@@ -67,8 +67,8 @@ def test_a_path_leads_where_kinematics_alone_does(by_path, solved):
 def test_dynamics_end_near_the_view(by_joints):
     env = _moving(by_joints, reachable="path", motion="dynamic")
     views, start = _views(env, 4)
-    sights, is_reachable = jax.jit(jax.vmap(lambda view: env.look(view, start)))(views)
-    is_reachable = np.asarray(is_reachable)
+    sights, motions = jax.jit(jax.vmap(lambda view: env.go(view, start)))(views)
+    is_reachable = np.asarray(motions.is_found)
     position, turn = _errors(env, views, sights)
     # The error of IK, 1 mm and 0.1 degrees, and that of the motion.
     assert np.all(position[is_reachable] < 2e-3) and np.all(turn[is_reachable] < np.deg2rad(0.3))

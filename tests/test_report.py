@@ -98,6 +98,7 @@ def test_one_trial_has_no_interval_for_means() -> None:
     raw = {"random_search": one, "cma_es": one, "sac": trials((1, 1), 5)}
     summary = report.results(raw, CONFIG, {})
     assert summary["cma_es"]["evaluations_mean_ci95"] is None
+    assert all(len(cells) == 3 for _, cells in rows(summary))
 
 
 def test_an_arm_without_speeds_has_no_times(arrays: dict[str, Any]) -> None:
@@ -106,7 +107,6 @@ def test_an_arm_without_speeds_has_no_times(arrays: dict[str, Any]) -> None:
     assert summary["sac"]["motion_time_s_mean"] is None
     json.dumps(summary, allow_nan=False)
     assert dict(rows(summary))["time of the motions, mean (s)"][0].ours == ""
-    assert all(len(cells) == 3 for _, cells in rows(summary))
 
 
 def test_table_shows_ours_beside_the_thesis(results: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ import trimesh
 from second_arm import MJCF
 from vsearch_jax.config import SceneConfig
 from vsearch_jax.meshes import inspect, read_mesh
-from vsearch_jax.scene import SceneError, available, build_scene, xml_folder
+from vsearch_jax.scene import Scene, SceneError, available, build_scene, xml_folder
 
 # Thesis 3.1: KUKA LWR 4+.
 LIMITS_DEG = [170, 120, 170, 120, 170, 120, 170]
@@ -30,6 +30,14 @@ f 1 4 3
 @pytest.fixture(scope="module")
 def lwr() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(xml_folder() / "arm" / "lwr.xml"))
+
+
+def _placed_vertices(scene: Scene) -> np.ndarray:
+    """The vertices of the object's mesh in world."""
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    geom = scene.object_geom_ids[0]
+    return scene.mj_model.mesh_vert @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
 
 
 def _bodies_of(model: mujoco.MjModel, prefix: str) -> list[int]:
@@ -134,10 +142,7 @@ def test_a_mesh_stands_in_the_middle_of_the_table(tmp_path):
     path = tmp_path / "part.obj"
     path.write_text(TETRAHEDRON)
     scene = build_scene(SceneConfig(object=str(path)))
-    data = mujoco.MjData(scene.mj_model)
-    mujoco.mj_forward(scene.mj_model, data)
-    geom = scene.object_geom_ids[0]
-    vertices = scene.mj_model.mesh_vert @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    vertices = _placed_vertices(scene)
     np.testing.assert_allclose(vertices.min(axis=0), [-0.05, -0.025, 0], atol=1e-6)
     np.testing.assert_allclose(vertices.max(axis=0), [0.05, 0.025, 0.07], atol=1e-6)
 
@@ -213,10 +218,7 @@ def test_meshes_of_every_format_stand_alike(tmp_path, suffix, caplog):
     shape = trimesh.creation.box((0.1, 0.06, 0.04), transform=trimesh.transformations.translation_matrix((3, 4, 5)))
     path.write_bytes(as_bytes(shape.export(file_type=suffix)))
     scene = build_scene(SceneConfig(object=str(path)))
-    data = mujoco.MjData(scene.mj_model)
-    mujoco.mj_forward(scene.mj_model, data)
-    geom = scene.object_geom_ids[0]
-    vertices = scene.mj_model.mesh_vert @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    vertices = _placed_vertices(scene)
     np.testing.assert_allclose(vertices.min(axis=0), [-0.05, -0.03, 0], atol=1e-6)
     np.testing.assert_allclose(vertices.max(axis=0), [0.05, 0.03, 0.04], atol=1e-6)
     assert not caplog.records
@@ -254,10 +256,7 @@ def test_a_mesh_is_scaled_and_stays_where_its_file_has_it_if_wanted(tmp_path, su
     shape = trimesh.creation.box((100, 60, 40), transform=trimesh.transformations.translation_matrix((10, 20, 30)))
     path.write_bytes(as_bytes(shape.export(file_type=suffix)))
     scene = build_scene(SceneConfig(object=str(path), mesh_scale=0.001, is_mesh_recentred=False))
-    data = mujoco.MjData(scene.mj_model)
-    mujoco.mj_forward(scene.mj_model, data)
-    geom = scene.object_geom_ids[0]
-    vertices = scene.mj_model.mesh_vert @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    vertices = _placed_vertices(scene)
     np.testing.assert_allclose(vertices.min(axis=0), [-0.04, -0.01, 0.01], atol=1e-6)
     np.testing.assert_allclose(vertices.max(axis=0), [0.06, 0.05, 0.05], atol=1e-6)
 

@@ -30,16 +30,7 @@ from vsearch_jax.planning import (
     time_path,
 )
 from vsearch_jax.scene import SceneError, build_scene
-from vsearch_jax.types import (
-    Camera,
-    EncoderState,
-    EpisodeState,
-    Image,
-    PlanStatus,
-    ReachabilityMap,
-    Sight,
-    View,
-)
+from vsearch_jax.types import Camera, EncoderState, EpisodeState, Image, PlanStatus, ReachabilityMap, Sight, View
 
 _REACH_SEED = 20_191_201
 """Of the starts from which the reachability map is solved: the same map in every run, whatever the run's seed."""
@@ -175,11 +166,20 @@ class ViewSearchEnv(Env):
         The arm's configuration varies: of the solutions found it is the one nearest to random joints.
         Where IK fails between the cells of the map, the view of the nearest reachable cell is returned.
         """
-        view, joints = self.random_view(key)
-        qpos, is_reachable = self.solve(view, joints)
-        cell_view, cell_qpos = self.nearest_view(view)
-        view = jax.tree.map(lambda a, b: jnp.where(is_reachable, a, b), view, cell_view)
-        return view, jnp.where(is_reachable, qpos, cell_qpos)
+        view, qpos, _ = self.settle(*self.random_view(key), jnp.bool_(False))
+        return view, qpos
+
+    def settle(self, view: View, qpos: Array, is_fixed: Array) -> tuple[View, Array, Array]:
+        """Returns a view, joints f32[nq] for it near `qpos` (f32[nq]), and bool[] whether they reach it.
+
+        Where `view` is not reached, the map's nearest reachable cell takes its place, unless it `is_fixed` (bool[]).
+        """
+        joints, is_reachable = self.solve(view, qpos)
+        stays = is_reachable | is_fixed
+        cell = nearest_cell(self.reach, view)
+        near = (View(self.reach.azimuths[cell[0]], self.reach.elevations[cell[1]]), self.reach.qpos[cell])
+        view, joints = jax.tree.map(lambda a, b: jnp.where(stays, a, b), (view, joints), near)
+        return view, joints, is_reachable | ~is_fixed
 
     def random_view(self, key: Array) -> tuple[View, Array]:
         """Returns a view, uniform over the band, and random joints f32[nq] to come from."""
@@ -188,11 +188,6 @@ class ViewSearchEnv(Env):
         low, high = self.reach.band
         view = View(jnp.pi * (2.0 * numbers[0] - 1.0), low + (high - low) * numbers[1])
         return view, self._joints(numbers[2:])
-
-    def nearest_view(self, view: View) -> tuple[View, Array]:
-        """Returns the view of the map's reachable cell nearest to `view`, and the cell's joints f32[nq]."""
-        cell = nearest_cell(self.reach, view)
-        return View(self.reach.azimuths[cell[0]], self.reach.elevations[cell[1]]), self.reach.qpos[cell]
 
     def random_joints(self, key: Array) -> Array:
         """Returns f32[nq], the joints that move the camera uniform inside their limits, the others at home."""
@@ -208,11 +203,6 @@ class ViewSearchEnv(Env):
         """Returns what is seen from a random reachable view."""
         view, qpos = self.sample_pose(key)
         return self.see(view, qpos)
-
-    def look(self, view: View, qpos: Array) -> tuple[Sight, Array]:
-        """Returns what is seen from `view` when the arm comes from joints `qpos` (f32[nq]), and bool[] is_reachable."""
-        sight, motion = self.go(view, qpos)
-        return sight, motion.is_found
 
     def go(self, view: View, qpos: Array) -> tuple[Sight, Motion]:
         """Returns what is seen from `view`, and the motion there from joints `qpos` (f32[nq])."""

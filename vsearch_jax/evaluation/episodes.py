@@ -55,7 +55,6 @@ def run_episode(episode: tuple[Array, Sight], *, env: ViewSearchEnv, actor: Any,
         band=env.reach.band,
         threshold=jnp.asarray(env.config.env.threshold),
         task=sac.PolicyTask(actor, start),
-        initial_score=start.metrics["similarity"],
     )
     result = sac.search(search_key, env.step, args, env.config)
     last = episode_of(result.end.state)

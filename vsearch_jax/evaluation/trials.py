@@ -14,7 +14,7 @@ from vsearch_jax.evaluation.views import map_batched
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
-from vsearch_jax.search.common import is_running, to_result
+from vsearch_jax.search.common import is_running, taken, to_result
 from vsearch_jax.types import Camera, SearchResult, Sight, View
 
 
@@ -120,8 +120,9 @@ def _generation(
     sights, motions = _go_round(env, trial.qpos, views)
     similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(sights.code, target.code)
     scores = jnp.where(motions.is_found, similarity, -jnp.inf)
-    is_hit = (scores >= args.threshold).astype(jnp.int32)
-    is_moved = motions.is_found & (jnp.cumsum(is_hit) - is_hit == 0)  # not after the view that ends the search
+    # Not after the view that ends the search, nor to those that only fill up the generation.
+    is_asked = jnp.arange(num_views) < jnp.asarray([method.num_views for method in methods])[number]
+    is_moved = motions.is_found & taken(scores, args.threshold) & is_asked
     qpos, costs = _follow(env, trial, sights.qpos, motions._replace(is_found=is_moved))
     states, best = jax.lax.switch(number, [functools.partial(tell, i) for i in numbers], states, views, scores)
     camera = jax.tree.map(lambda new, old: jnp.where(best >= 0, new[best], old), sights.camera, trial.camera)

@@ -50,12 +50,9 @@ def look_at(env: ViewSearchEnv, asked: Asked) -> Sight:
 
     The code of a fixed view that is not reached is 0, which matches nothing.
     """
-    qpos, is_reachable = env.solve(asked.view, asked.qpos)
-    stays = is_reachable | asked.is_fixed
-    near = env.nearest_view(asked.view)
-    view, qpos = jax.tree.map(lambda a, b: jnp.where(stays, a, b), (asked.view, qpos), near)
+    view, qpos, is_reached = env.settle(*asked)
     sight = env.see(view, qpos)
-    code = jnp.where(is_reachable | ~stays, sight.code, 0.0)
+    code = jnp.where(is_reached, sight.code, 0.0)
     return sight.replace(code=code)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
 
 

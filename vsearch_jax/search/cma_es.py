@@ -95,10 +95,10 @@ def method(config: CMAESConfig) -> Method:
     )
 
 
-def _begin(method: tuple[CMA_ES, Any], config: CMAESConfig, args: SearchArgs, score: Array) -> _State:
+def _begin(cma: tuple[CMA_ES, Any], config: CMAESConfig, args: SearchArgs, score: Array) -> _State:
     return _State(
         record=start_record(args.initial, score, config.max_generations),
-        strategy=_start(*method, _to_units(args.initial, args.band)),
+        strategy=_start(*cma, _to_units(args.initial, args.band)),
         population=jnp.zeros((config.population, 2)),
         run_fitness=jnp.float32(jnp.inf),
         run_point=_to_units(args.initial, args.band),
@@ -112,18 +112,16 @@ def _keys(key: Array, state: _State) -> tuple[Array, Array]:
     return sample_key, restart_key
 
 
-def _ask(method: tuple[CMA_ES, Any], key: Array, args: SearchArgs, state: _State) -> tuple[View, _State]:
-    algorithm, params = method
+def _ask(cma: tuple[CMA_ES, Any], key: Array, args: SearchArgs, state: _State) -> tuple[View, _State]:
+    algorithm, params = cma
     with _evosax_promotion():
         population, strategy = algorithm.ask(_keys(key, state)[0], state.strategy, params)
     views, _ = jax.vmap(_to_view, in_axes=(0, None))(population, args.band)
     return views, dataclasses.replace(state, strategy=strategy, population=population)
 
 
-def _tell(
-    method: tuple[CMA_ES, Any], key: Array, args: SearchArgs, state: _State, views: View, scores: Array
-) -> _State:
-    (algorithm, params), population, strategy = method, state.population, state.strategy
+def _tell(cma: tuple[CMA_ES, Any], key: Array, args: SearchArgs, state: _State, views: View, scores: Array) -> _State:
+    (algorithm, params), population, strategy = cma, state.population, state.strategy
     sample_key, restart_key = _keys(key, state)
     _, excess = jax.vmap(_to_view, in_axes=(0, None))(population, args.band)
     fitness = jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2

@@ -27,14 +27,12 @@ class SearchArgs:
       band: f32[2] rad, lowest and highest elevation to search.
       threshold: f32[], the score at which the search ends.
       task: any pytree, handed to `score_fn` untouched: the scene, encoder and target code, for instance.
-      initial_score: f32[], the score of the initial view where its image has been taken already; else None.
     """
 
     initial: View
     band: Array
     threshold: Array
     task: Any
-    initial_score: Array | None = None
 
 
 @flax.struct.dataclass
@@ -81,7 +79,7 @@ class Method(NamedTuple):
 
 def run(key: Array, score_fn: ScoreFn, args: SearchArgs, method: Method) -> SearchResult:
     """Returns what `method` finds; `score_fn` is vmapped over the views of a generation."""
-    state = method.start(args, initial_score(score_fn, args))
+    state = method.start(args, score_fn(args.initial, args.task))
     body = functools.partial(_generation, key, score_fn, args, method)
     state = jax.lax.while_loop(lambda state: is_running(method.record(state), args.threshold), body, state)
     return to_result(method.record(state))
@@ -91,11 +89,6 @@ def _generation(key: Array, score_fn: ScoreFn, args: SearchArgs, method: Method,
     views, state = method.ask(key, args, state)
     scores = jax.vmap(score_fn, in_axes=(0, None))(views, args.task)
     return method.tell(key, args, state, views, scores)
-
-
-def initial_score(score_fn: ScoreFn, args: SearchArgs) -> Array:
-    """Returns the score f32[] of the initial view."""
-    return score_fn(args.initial, args.task) if args.initial_score is None else args.initial_score
 
 
 def start_record(view: View, score: Array, max_generations: int) -> Record:
@@ -111,14 +104,19 @@ def start_record(view: View, score: Array, max_generations: int) -> Record:
     )
 
 
+def taken(scores: Array, threshold: Array) -> Array:
+    """Returns bool[N], which of a generation's images are taken: none after the first whose score meets `threshold`."""
+    is_hit = (scores >= threshold).astype(jnp.int32)
+    return jnp.cumsum(is_hit) - is_hit == 0
+
+
 def add_generation(record: Record, views: View, scores: Array, threshold: Array) -> Record:
     """Returns `record` with one more generation of `views` (View of f32[N] rad) and their `scores` (f32[N]).
 
     The images are taken one by one and the search ends with the first that meets `threshold` (f32[]); those after it
     are not taken, so they neither count nor enter the best.
     """
-    is_hit = (scores >= threshold).astype(jnp.int32)
-    is_taken = jnp.cumsum(is_hit) - is_hit == 0  # no hit among those before it
+    is_taken = taken(scores, threshold)
     taken_scores = jnp.where(is_taken, scores, -jnp.inf)
     best = jnp.argmax(taken_scores)
     is_better = taken_scores[best] > record.score

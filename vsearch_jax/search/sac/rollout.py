@@ -107,7 +107,7 @@ def search(key: Array, step_fn: StepFn, args: SearchArgs, config: Config) -> Sea
     Args:
       key: PRNG key of the random steps.
       step_fn: the environment's `step`.
-      args: SearchArgs of one problem, its `task` a PolicyTask; `initial` and `initial_score` are those of the task.
+      args: SearchArgs of one problem, its `task` a PolicyTask; `initial` is that of the task.
       config: the run's; `sac`, `env` and `evaluation.patience` are read.
 
     Returns:
