@@ -172,6 +172,32 @@ def test_resume_with_another_config_names_the_field_and_changes_nothing(
     assert contents(tmp_path) == before
 
 
+def test_resume_for_a_target_out_of_reach_changes_nothing(
+    quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = str(tmp_path / "run")
+    cli.main(["train", "--preset", "smoke", "--out", out])
+    before = contents(tmp_path)
+    message = fails(capsys, "train", "--out", out, "--resume", "--evaluation.target-elevation-deg", "89")
+    assert "target_elevation_deg is 89" in message
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_a_seed_out_of_range_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path, seed: int) -> None:
+    out = tmp_path / "run"
+    message = fails(capsys, "train", "--preset", "smoke", "--out", str(out), f"--seed={seed}")
+    assert f"seed is {seed}; allowed: 0 to 4294967295" in message
+    assert not any(out.iterdir())
+
+
+def test_a_home_that_does_not_exist_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = str(tmp_path / "run")
+    assert "does not exist" in fails(
+        capsys, "train", "--preset", "smoke", "--out", out, "--object", "~nobody0/part.stl"
+    )
+
+
 def test_an_unfinished_run_is_not_evaluated(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     config = Config.preset("smoke")
     runner.start(tmp_path / "run", config, seed=0)
@@ -320,8 +346,9 @@ def test_a_damaged_line_of_metrics_is_named(quick: None, capsys: pytest.CaptureF
     out = tmp_path / "run"
     cli.main(["train", "--preset", "smoke", "--out", str(out)])
     lines = (out / "metrics.jsonl").read_text().splitlines()
-    for damage in ("\0\0", "3", '{"iteration": 3}'):
-        (out / "metrics.jsonl").write_text("\n".join([*lines[:3], damage, *lines[4:]]) + "\n")
+    for damage in ("\0\0", "\udcff", "3", '{"iteration": 3}'):
+        text = "\n".join([*lines[:3], damage, *lines[4:]]) + "\n"
+        (out / "metrics.jsonl").write_bytes(text.encode(errors="surrogateescape"))
         assert "metrics.jsonl: line 4 is damaged" in fails(capsys, "eval", str(out))
 
 

@@ -58,3 +58,31 @@ def test_fields_that_do_not_fit_are_named():
     del values["encoder"]["channels"]
     with pytest.raises(ConfigError, match=r"EncoderConfig: unknown fields \['colour'\], missing fields \['channels'\]"):
         Config.from_dict(values)
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value"),
+    [
+        ("scene", "object", 5),
+        ("scene", "image_size", 128.0),
+        ("scene", "radius", "0.35"),
+        ("encoder", "channels", [32, "64"]),
+        ("encoder", "input", 1),
+        ("sac", "num_seeds", True),
+    ],
+)
+def test_a_value_of_another_type_is_named(part, field, value):
+    values = Config.preset("smoke").to_dict()
+    values[part][field] = value
+    with pytest.raises(ConfigError, match=rf"Config\.{field} is .*; allowed: "):
+        Config.from_dict(values)
+    values[part] = 3
+    with pytest.raises(ConfigError, match=rf"Config\.{part} is 3"):
+        Config.from_dict(values)
+
+
+@pytest.mark.parametrize("name", ["cpu", "thesis", "gpu"])
+def test_chunks_of_a_preset_hold_one_stage(name):
+    config = Config.preset(name)
+    assert config.chunk_length * config.num_chunks == config.num_iterations
+    assert config.encoder.num_updates % config.chunk_length == 0

@@ -109,6 +109,20 @@ def test_an_arm_without_speeds_has_no_times(arrays: dict[str, Any]) -> None:
     assert dict(rows(summary))["time of the motions, mean (s)"][0].ours == ""
 
 
+def test_a_search_that_saw_nothing_has_no_mean_cosine(arrays: dict[str, Any]) -> None:
+    blind = arrays | {"cma_es": arrays["cma_es"] | {"final_cosine": np.full(12, -np.inf)}}
+    summary = report.results(blind, CONFIG, {})
+    assert summary["cma_es"]["final_cosine_mean"] is None
+    json.dumps(summary, allow_nan=False)
+
+
+def test_help_is_counted_apart(arrays: dict[str, Any]) -> None:
+    helped = np.arange(120).reshape(3, 40) % 4 == 0
+    policies = arrays["sac"] | {"num_helped": helped.astype(np.int32), "is_success": np.ones((3, 40), bool)}
+    summary = report.results(arrays | {"sac": policies}, CONFIG, {})["sac"]
+    assert (summary["success_rate"], summary["helped_rate"], summary["unaided_success_rate"]) == (1.0, 0.25, 0.75)
+
+
 def test_table_shows_ours_beside_the_thesis(results: dict[str, Any]) -> None:
     console = Console(width=80, record=True, force_terminal=False)
     report.print_table(results, console)

@@ -66,7 +66,7 @@ def test_the_encoder_learns_and_then_stays(chunked):
     assert losses[-1] < losses[0]
     start = vs.init(jax.random.key(0), CONFIG)
     half = dataclasses.replace(CONFIG, num_chunks=4)
-    state, _ = vs.train(start, half)  # the chunk that ends within the policy stage
+    state, _ = vs.train(start, half)
     for _ in range(3):
         before = arrays(state.encoder)
         state, metrics = vs.train(state, half)

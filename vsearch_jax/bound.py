@@ -26,8 +26,8 @@ def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, co
     """Returns i32[], fewer steps than which no policy can need: a bound for one episode.
 
     A step changes azimuth and elevation by at most `action_scale_deg` each. The episode ends at the nearest view that
-    meets the threshold, which need not be the target. A whole spacing of the grid is subtracted: views within it of one
-    of the `grid`'s that meets the threshold may meet it too.
+    meets the threshold, which need not be the target. A whole spacing of the grid is subtracted: views within it of the
+    target, or of one of the `grid`'s that meets the threshold, may meet it too.
 
     Args:
       initial: View of f32[] rad.
@@ -38,13 +38,12 @@ def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, co
     """
     azimuth_spacing = 2.0 * jnp.pi / GRID_AZIMUTHS
     elevation_spacing = (band[1] - band[0]) / (GRID_ELEVATIONS - 1)
-    azimuth = jnp.abs(angle_difference(grid.view.azimuth, initial.azimuth)) - azimuth_spacing
-    elevation = jnp.abs(grid.view.elevation - initial.elevation) - elevation_spacing
+
+    def way(view: View) -> Array:
+        azimuth = jnp.abs(angle_difference(view.azimuth, initial.azimuth)) - azimuth_spacing
+        return jnp.maximum(azimuth, jnp.abs(view.elevation - initial.elevation) - elevation_spacing)
+
     is_found = cosine_similarity(grid.code, target.code[None]) >= config.env.threshold
-    to_grid = jnp.where(is_found, jnp.maximum(azimuth, elevation), jnp.inf).min()
-    to_target = jnp.maximum(
-        jnp.abs(angle_difference(target.view.azimuth, initial.azimuth)),
-        jnp.abs(target.view.elevation - initial.elevation),
-    )
-    steps = jnp.minimum(to_grid, to_target) / math.radians(config.env.action_scale_deg)
+    to_grid = jnp.where(is_found, way(grid.view), jnp.inf).min()
+    steps = jnp.minimum(to_grid, way(target.view)) / math.radians(config.env.action_scale_deg)
     return jnp.maximum(jnp.ceil(steps - 1e-5), 1.0).astype(jnp.int32)

@@ -66,8 +66,11 @@ def save(run: Path, state: Any, config: Config) -> None:
 
 def latest_step(run: Path) -> int | None:
     """Returns the step of the last complete checkpoint in the folder `run`, None if there is none."""
-    steps = [int(path.name) for path in (run / CHECKPOINTS).glob("*") if path.name.isdecimal()]
-    return max(steps, default=None)
+    return max(_steps(run), default=None)
+
+
+def _steps(run: Path) -> list[int]:
+    return [int(path.name) for path in (run / CHECKPOINTS).glob("*") if path.name.isdecimal()]
 
 
 def restore(run: Path, template: Any, config: Config) -> Any:
@@ -140,9 +143,12 @@ def _read(run: Path, step: int, item: str, arguments: ocp.args.CheckpointArgs) -
         _check_stored_arrays(folder)
         with _one_error(), _manager(run) as manager:
             return manager.restore(step, args=ocp.args.Composite(**{item: arguments}))[item]
+    except (PermissionError, MemoryError):
+        raise
     except Exception as error:  # a damaged file shows as any of a dozen types, from JSON's to tensorstore's
-        reason = f"checkpoint {folder} is damaged ({_first_line(error)})"
-        raise CheckpointError(f"{reason}; delete this folder to go on from the one before") from error
+        earlier = [other for other in _steps(run) if other < step]
+        remedy = f"delete this folder to go on from {max(earlier)}" if earlier else "there is no other; train anew"
+        raise CheckpointError(f"checkpoint {folder} is damaged ({_first_line(error)}); {remedy}") from error
 
 
 @contextlib.contextmanager

@@ -94,7 +94,7 @@ def _with_shortcuts(command: Train) -> Train:
 
 def _absolute(name: str) -> str:
     """Returns a path made absolute, since a run may go on from another folder; a plain name as it is."""
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))  # which leaves the home of an unknown user as it is
     return str(path.resolve()) if path.suffix or path.parent != Path(".") else name
 
 

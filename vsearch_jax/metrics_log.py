@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from vsearch_jax.run_folder import EVENTS, METRICS, RunError, write_text
+from vsearch_jax.run_folder import EVENTS, METRICS, RunError, write
 
 STAGES = ("encoder", "policy")
 """Names of the values of the metric `stage`."""
@@ -27,7 +27,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     path = run / METRICS
     if not path.is_file():
         return []
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8", errors="replace")  # what is no text is no JSON either
     whole = text[: text.rfind("\n") + 1]  # a killed write leaves a last line without its end
     return [_parse(path, number, line) for number, line in enumerate(whole.splitlines(), 1)]
 
@@ -55,7 +55,7 @@ class MetricsLog:
         """Opens the logs in the folder `run` to go on at iteration `step`; what they hold of later ones is dropped."""
         self.lines = [line for line in read_metrics(run) if line["iteration"] < step]
         self._path = run / METRICS
-        write_text(self._path, "".join(json.dumps(line) + "\n" for line in self.lines))
+        write(self._path, "".join(json.dumps(line) + "\n" for line in self.lines))
         self._events = SummaryWriter(str(run / EVENTS), purge_step=step)
 
     def append(self, metrics: Mapping[str, np.ndarray], first: int, seconds: float) -> None:

@@ -92,7 +92,7 @@ def held(run: Path) -> Iterator[None]:
 
 def write_config(run: Path, config: Config, seed: int) -> None:
     """Writes `config.json`, the run's seed in it; the other half are `read_config` and `read_seed`."""
-    write_text(run / CONFIG, json.dumps({"seed": seed, **config.to_dict()}, indent=2) + "\n")
+    write(run / CONFIG, json.dumps({"seed": seed, **config.to_dict()}, indent=2) + "\n")
 
 
 def read_config(run: Path) -> Config:
@@ -133,12 +133,12 @@ def _read(run: Path) -> dict[str, Any]:
     return values
 
 
-def write_text(path: Path, text: str) -> None:
-    """Replaces the file `path` by `text` in one step: whoever reads it sees the old text or the new one."""
+def write(path: Path, content: str | bytes) -> None:
+    """Replaces the file `path` in one step: whoever reads it sees the old content or the new one."""
     temporary = path.with_name(f".{path.name}.tmp")
     try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())  # else a crash of the machine may leave the new name with no content
         temporary.replace(path)

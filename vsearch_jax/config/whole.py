@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vsearch_jax.config.motion import IKConfig, PlanningConfig
 from vsearch_jax.config.parts import (
@@ -81,7 +81,7 @@ class Config:
         """Returns the config that `to_dict` wrote.
 
         Raises:
-          ConfigError: a field is unknown or missing, or its value is out of range.
+          ConfigError: a field is unknown or missing, or its value is of another type or out of range.
         """
         return _from_dict(Config, values)
 
@@ -94,13 +94,27 @@ def _from_dict(cls: type, values: dict[str, Any]) -> Any:
             f"{cls.__name__}: unknown fields {unknown}, missing fields {missing}; expected {sorted(fields)}"
         )
     arguments = {}
-    for name, value in values.items():
-        default = fields[name].default_factory
-        if dataclasses.is_dataclass(default):
-            arguments[name] = _from_dict(default, value)  # pyright: ignore[reportArgumentType] # a dataclass type is its own factory
-        else:
-            arguments[name] = tuple(value) if isinstance(value, list) else value
+    for name, hint in get_type_hints(cls).items():
+        value = tuple(values[name]) if isinstance(values[name], list) else values[name]
+        if dataclasses.is_dataclass(hint) and isinstance(value, dict):
+            value = _from_dict(hint, value)  # pyright: ignore[reportArgumentType] # a hint that is a dataclass is a type
+        elif not _fits(value, hint):
+            raise ConfigError(f"{cls.__name__}.{name} is {value!r}; allowed: {getattr(hint, '__name__', hint)}")
+        arguments[name] = value
     return cls(**arguments)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Returns whether `value` is of the type `hint`, one of those that fields of a config have."""
+    arguments = get_args(hint)
+    if get_origin(hint) is Literal:
+        return value in arguments
+    if get_origin(hint) is tuple:
+        return isinstance(value, tuple) and all(_fits(entry, arguments[0]) for entry in value)
+    if arguments:
+        return any(_fits(value, argument) for argument in arguments)
+    kinds = (int, float) if hint is float else hint
+    return isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
 
 
 PRESETS: dict[str, Config] = {
@@ -124,11 +138,11 @@ PRESETS: dict[str, Config] = {
             pool_size=4096,
         ),
         sac=SACConfig(num_seeds=3, num_environment_steps=10_880),
-        num_chunks=40,
+        num_chunks=767,
     ),
     "gpu": Config(
         encoder=EncoderConfig(num_updates=12_000, batch_size=256, decoder_size=128, pool_size=4096),
         sac=SACConfig(num_seeds=10, num_environment_steps=10_240),
-        num_chunks=40,
+        num_chunks=79,
     ),
 }

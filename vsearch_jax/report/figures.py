@@ -49,7 +49,8 @@ def reachability(reach: ReachabilityMap) -> Figure:
     )
     axes.set_xlim(ends)
     handles = [Patch(color=REACHABLE), Patch(color=UNREACHABLE), ours, thesis]
-    labels = ["reachable", "not reachable", f"at every azimuth: {low:.0f}–{high:.0f}°", "thesis: 40–70°"]
+    band = "none" if np.isnan(low) else f"{low:.0f}–{high:.0f}°"
+    labels = ["reachable", "not reachable", f"at every azimuth: {band}", "thesis: 40–70°"]
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
 

@@ -12,6 +12,7 @@ from typing import Any
 import jinja2
 from matplotlib.figure import Figure
 
+from vsearch_jax import run_folder
 from vsearch_jax.config import Config
 from vsearch_jax.report import figures
 from vsearch_jax.report.style import styled
@@ -79,10 +80,10 @@ def write(folder: Path, results: Mapping[str, Any], pictures: Mapping[str, Figur
     (folder / "figures").mkdir(exist_ok=True)
     images = {name: _png(picture) for name, picture in pictures.items()}
     for name, image in images.items():
-        (folder / "figures" / f"{name}.png").write_bytes(image)
-    (folder / "report.html").write_text(_page(folder.absolute().name, results, images, config), encoding="utf-8")
+        run_folder.write(folder / "figures" / f"{name}.png", image)
+    run_folder.write(folder / "report.html", _page(folder.absolute().name, results, images, config))
     # The last one: where it is, the report is whole.
-    (folder / "results.json").write_text(text, encoding="utf-8")
+    run_folder.write(folder / "results.json", text)
 
 
 @styled

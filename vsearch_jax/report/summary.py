@@ -83,7 +83,9 @@ def summarize(trials: Mapping[str, Any]) -> dict[str, Any]:
         bound = trials["steps_lower_bound"]
         summary |= _mean("steps_lower_bound_mean", bound)
         summary["evaluations_over_lower_bound"] = float(evaluations.mean() / bound.mean())
-        summary |= _rate("helped_rate", (trials["num_helped"] > 0).sum(), evaluations.size)
+        is_helped = trials["num_helped"] > 0
+        summary |= _rate("helped_rate", is_helped.sum(), evaluations.size)
+        summary |= _rate("unaided_success_rate", (trials["is_success"] & ~is_helped).sum(), evaluations.size)
     return summary
 
 
@@ -94,9 +96,10 @@ def _rate(name: str, count: Any, total: Any) -> dict[str, Any]:
 
 
 def _mean(name: str, values: np.ndarray) -> dict[str, Any]:
-    """Returns a mean with the bootstrap's percentile interval; none where there is one value, no mean with NaN."""
+    """Returns a mean with the bootstrap's percentile interval; none where there is one value, no mean of NaN or inf."""
     values = np.asarray(values, np.float64)
-    if np.isnan(values).any():  # an arm without speed limits has no times
+    # An arm without speed limits has no times, a search that never got to a view no cosine.
+    if not np.isfinite(values).all():
         return {name: None, f"{name}_ci95": None}
     interval = None
     if values.size > 1:

@@ -12,7 +12,8 @@ from vsearch_jax.report.summary import SEARCHERS
 
 FOOTNOTE = (
     "Ours: all trials, 95 % intervals (Wilson for rates, bootstrap for means). "
-    "Thesis: means of random search and CMA-ES are over the trials that met the threshold; SAC for one target."
+    "Thesis: means of random search and CMA-ES are over the trials that met the threshold; SAC for one target. "
+    "Our CMA-ES restarts where it stalls and ties its step size to the cosine."
 )
 
 
@@ -49,6 +50,7 @@ MEASURES = (
     Measure("motion_time_s_mean", "time of the motions, mean (s)", digits=1),
     Measure("plans_mean", "motions planned, mean", digits=2),
     Measure("helped_rate", "episodes with steps of help (%)", 100.0, 2),
+    Measure("unaided_success_rate", "success without any help (%)", 100.0, 2),
     Measure("environment_steps", "environment steps of training", digits=0),
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from importlib import resources
 from pathlib import Path
 
@@ -40,7 +41,7 @@ def find(part: str, name: str) -> Path:
       SceneError: there is none.
     """
     folder = "objects" if part == "object" else part
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))  # which leaves the home of an unknown user as it is
     if path.suffix or path.parent != Path("."):
         if not path.is_file():
             raise SceneError(

@@ -128,12 +128,15 @@ def _step(key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: 
     record, state = carry.record, carry.state
     steps = record.generation
     is_near = record.score >= _NEAR
-    has_improved = record.score - record.best_scores[steps - 2] > _IMPROVEMENT
-    is_helped = ~has_improved & ((steps >= config.evaluation.patience) | (is_near & (steps >= 2)))
+    # Before the second step there is nothing to compare with.
+    has_improved = (steps < 2) | (record.score > record.best_scores[steps - 2] + _IMPROVEMENT)
+    is_helped = ~has_improved & ((steps >= config.evaluation.patience) | is_near)
     is_helped |= state.info["is_reachable"] < 0.5
     num_around = jnp.where(has_improved, 0, carry.num_around)
 
-    around, swept = _around_best(key, record, num_around, args), _swept(key, steps, state, args.band, config)
+    around_key, sweep_key = jax.random.split(key)  # the same at every step, so that the turns go on
+    around = _around_best(around_key, record, num_around, args)
+    swept = _swept(sweep_key, steps, state, args.band, config)
     view = jax.tree.map(lambda a, b: jnp.where(is_near, a, b), around, swept)
     observation: Array = state.obs  # pyright: ignore[reportAssignmentType] # brax allows dictionaries too
     action = act(None, args.task.actor, observation, config.sac)
