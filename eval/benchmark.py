@@ -94,7 +94,7 @@ def compare(cases: dict[str, peers.Case], size: int, path: Path) -> dict[str, fl
     """
     rows, differences = [], {}
     for name, case in cases.items():
-        own = np.asarray(peers.ours(case, size, has_shadows=True)().rgb[0])
+        own = np.asarray(peers.ours(case, size, has_shadows=True)()[0][0])
         try:
             other = peers.opengl(case, size)()[0] / 255.0
         except Exception as error:  # it depends on the machine how this fails
@@ -114,9 +114,22 @@ def compare(cases: dict[str, peers.Case], size: int, path: Path) -> dict[str, fl
     return differences
 
 
+def costs(cases: dict[str, peers.Case], size: int) -> dict[str, dict[str, float]]:
+    """Returns seconds to compile and memory in MiB an image of each scene, with shadows."""
+    result = {}
+    for name, case in cases.items():
+        seconds, memory = peers.compile_cost(case, size, has_shadows=True)
+        result[name] = {"compile_seconds": seconds, "mib_per_image": memory}
+        print(f"{name:16s} {size:4d} px  compiled in {seconds:.1f} s, {memory:.2f} MiB an image", flush=True)
+    return result
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Measures all scenes, sizes and batches, prints the ratios, and writes results.json and two pictures."""
+    jax.config.update("jax_enable_compilation_cache", False)
     rows: list[Row] = []
+    largest = max(arguments.batch)
+    compiled = costs({"project": peers.project_case(largest), "5000 faces": peers.mesh_case(5000, largest)}, 128)
     for batch in arguments.batch:
         cases = {"project": peers.project_case(batch)}
         cases |= {f"{faces} faces": peers.mesh_case(faces, batch) for faces in (5000, 20000)}
@@ -134,7 +147,7 @@ def run(arguments: argparse.Namespace) -> None:
     }
     differences = compare(cases, 384, arguments.out / "pictures.png")
     machine = {"platform": jax.default_backend(), "cores": os.cpu_count(), "jax": jax.__version__}
-    report = {"machine": machine, "rows": rows, "ratios": result, "differences": differences}
+    report = {"machine": machine, "rows": rows, "ratios": result, "differences": differences, "costs": compiled}
     (arguments.out / "results.json").write_text(json.dumps(report, indent=2))
     plot(rows, arguments.out / "rates.png")
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +18,7 @@ import trimesh
 
 import vsearch_jax as vs
 from vsearch_jax import geometry, render
-from vsearch_jax.types import Camera, Image, View
+from vsearch_jax.types import Camera, View
 
 FOVY = 0.8
 
@@ -90,17 +92,32 @@ def _directions(case: Case, size: int) -> np.ndarray:
     return np.einsum("bij,pj->bpi", case.rotations, local)
 
 
-def ours(case: Case, size: int, has_shadows: bool) -> Callable[[], Image]:
-    """Returns a call that draws colour, depth and geom numbers of the whole batch in one program."""
+def program(case: Case, size: int, has_shadows: bool) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+    """Returns the jitted function that draws colour, depth and geom numbers of a batch, and its arguments."""
     scene = render.compile_scene(case.model).replace(has_shadows=has_shadows)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     data = render.poses(case.data)
 
-    def one(position: jax.Array, rotation: jax.Array) -> Image:
-        return render.render(scene, data, Camera(position, rotation, jnp.float32(FOVY)), (size, size))
+    def one(position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        image = render.render(scene, data, Camera(position, rotation, jnp.float32(FOVY)), (size, size))
+        return image.rgb, image.depth, image.geom_id
 
-    program = jax.jit(jax.vmap(one))
-    positions, rotations = (jnp.asarray(a, dtype=jnp.float32) for a in (case.positions, case.rotations))
-    return lambda: jax.block_until_ready(program(positions, rotations))
+    return jax.jit(jax.vmap(one)), (jnp.asarray(case.positions, jnp.float32), jnp.asarray(case.rotations, jnp.float32))
+
+
+def ours(case: Case, size: int, has_shadows: bool) -> Callable[[], tuple[jax.Array, jax.Array, jax.Array]]:
+    """Returns a call that draws colour, depth and geom numbers of the whole batch in one program."""
+    draw, arguments = program(case, size, has_shadows)
+    return lambda: jax.block_until_ready(draw(*arguments))
+
+
+def compile_cost(case: Case, size: int, has_shadows: bool) -> tuple[float, float]:
+    """Returns the seconds that it takes to trace and compile the program, and its memory in MiB an image."""
+    draw, arguments = program(case, size, has_shadows)
+    start = time.perf_counter()
+    compiled = draw.lower(*arguments).compile()
+    seconds = time.perf_counter() - start
+    memory = compiled.memory_analysis()
+    return seconds, (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 2**20 / len(case.positions)
 
 
 def multi_ray(case: Case, size: int) -> Callable[[], object]:
@@ -126,11 +143,17 @@ def opengl(case: Case, size: int) -> Callable[[], list[np.ndarray]]:
     """
     renderer = mujoco.Renderer(case.model, size, size)
     camera = mujoco.MjvCamera()
+    for flag in (mujoco.mjtRndFlag.mjRND_HAZE, mujoco.mjtRndFlag.mjRND_REFLECTION):  # which we do not draw
+        renderer.scene.flags[flag] = 0
 
     def one(index: int) -> np.ndarray:
         renderer.update_scene(case.data, camera)
+        position, forward, up = case.positions[index], *(case.rotations[index].T[[2, 1]] * [[-1.0], [1.0]])
+        for light in renderer.scene.lights[: renderer.scene.nlight]:
+            if light.headlight:
+                light.pos, light.dir = position, forward
         for eye in renderer.scene.camera:
-            eye.pos, eye.forward, eye.up = case.positions[index], *(case.rotations[index].T[[2, 1]] * [[-1.0], [1.0]])
+            eye.pos, eye.forward, eye.up = position, forward, up
             half = np.tan(FOVY / 2) * eye.frustum_near
             eye.frustum_bottom, eye.frustum_top, eye.frustum_center = -half, half, 0.0
             eye.frustum_width = half

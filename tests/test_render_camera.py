@@ -101,3 +101,30 @@ def test_derivatives_of_colour_and_light_equal_finite_differences(model, data):
         difference = (value(step)[0] - value(-step)[0]) / (2 * step)
         assert np.abs(difference) > 1e-3, name
         np.testing.assert_allclose(slope, difference, rtol=2e-2, err_msg=name)
+
+
+@pytest.mark.parametrize("batch_size", [2, 3, 8])
+def test_a_batch_drawn_in_parts_is_the_batch(model, data, batch_size):
+    scene, frames = render.compile_scene(model), render.poses(data)
+    eye = render.camera(frames, model, "plain")
+    cameras = jax.vmap(lambda height: eye.replace(position=eye.position.at[2].set(height)))(
+        np.float32([1.5, 2, 3, 4, 5])
+    )
+    whole = jax.jit(jax.vmap(lambda camera: render.render(scene, frames, camera, SIZE)))(cameras)
+    parts = jax.jit(lambda c: render.render_batch(scene, frames, c, SIZE, batch_size=batch_size))(cameras)
+    assert len(np.unique(np.sum(whole.geom_id >= 0, axis=(1, 2)))) == 5
+    jax.tree.map(np.testing.assert_array_equal, parts, whole)
+
+
+def test_a_batch_of_none_is_refused(model, data):
+    frames = render.poses(data)
+    with pytest.raises(render.RenderError, match="batch_size is 0; allowed: 1 or more"):
+        render.render_batch(
+            render.compile_scene(model), frames, render.camera(frames, model, "plain"), SIZE, batch_size=0
+        )
+
+
+def test_a_colour_that_is_not_opaque_is_told_of(caplog):
+    text = CAMERAS.replace('<geom size=".5"/>', '<geom name="glass" size=".5" rgba="1 0 0 .4"/>')
+    render.compile_scene(mujoco.MjModel.from_xml_string(text))
+    assert "drawn as if they were opaque" in caplog.text and "glass" in caplog.text

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from vsearch_jax.batches import map_batched
 from vsearch_jax.bound import band_grid
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.env import ViewSearchEnv, check_band
 from vsearch_jax.evaluation.episodes import episode_keys, evaluate_policies
 from vsearch_jax.evaluation.outcome import outcome
 from vsearch_jax.evaluation.trials import search_trials
-from vsearch_jax.evaluation.views import Asked, initial_views, look_at, map_batched, protocol_target
+from vsearch_jax.evaluation.views import Asked, initial_views, look_at, protocol_target
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.search import cma_es, random_search
 from vsearch_jax.types import ReachabilityMap, Sight, TrainState

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from vsearch_jax.batches import map_batched
 from vsearch_jax.env import ViewSearchEnv
-from vsearch_jax.evaluation.views import map_batched
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from vsearch_jax.batches import map_batched
 from vsearch_jax.render import shading, texturing, trace
 from vsearch_jax.render.boundary import materialize, unknown_zero
 from vsearch_jax.render.camera import magnified, pinhole, pixel_rays
@@ -89,6 +90,29 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
     sight = _Sight(frames, rotation, lights, shadows, zero)
     parts = jax.lax.map(functools.partial(_render_tile, scene, sight), tiles)
     return jax.tree.map(tiling.join, parts)
+
+
+def render_batch(scene: RenderScene, data: Any, cameras: Camera, size: tuple[int, int], *, batch_size: int) -> Image:
+    """Returns what each of `cameras` sees, drawn `batch_size` at a time, so that any number fits into memory.
+
+    Where poses or the scene differ from image to image, `batches.map_batched` over a function of yours does the same.
+
+    Args:
+      scene: RenderScene.
+      data: see `render`.
+      cameras: Camera with a leading axis N.
+      size: height and width in pixels, static.
+      batch_size: images at a time, static; more than N is N.
+
+    Returns:
+      Image with a leading axis N.
+
+    Raises:
+      RenderError: `batch_size` is not positive.
+    """
+    if batch_size < 1:
+        raise RenderError(f"batch_size is {batch_size}; allowed: 1 or more")
+    return map_batched(lambda camera: render(scene, data, camera, size), cameras, batch_size)
 
 
 def silhouette(image: Image, geom_ids: tuple[int, ...]) -> Array:

@@ -37,6 +37,8 @@ def _geom_rows(scene: RenderScene, frames: trace.Frames, slot: Array, zero: Arra
     placed = materialize(jnp.concatenate([quaternion, frames.origin], axis=1).T, zero)
     # Apart from the poses: a table that all images of a batch share is looked up in half the time.
     worn = [*scene.size.T, *scene.rgb.T, scene.specular, scene.shininess, scene.emission]
+    if len(scene.geom_ids) == 1:  # nothing to look up
+        return [jnp.broadcast_to(row[0], slot.shape) for row in (*placed, *worn)]
     return materialize(look_up(placed, slot) + look_up(worn, slot), zero)
 
 

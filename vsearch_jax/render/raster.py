@@ -24,7 +24,7 @@ _NEAR = 1e-6
 # Rounding of a projected corner, far more than it is, in pixels.
 _SLACK = 1e-3
 # Pairs of face and pixel that are tested at a time.
-_PART = 8192
+_PART = 4096
 
 
 class Pinhole(NamedTuple):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import flax.struct
 import jax.numpy as jnp
 import mujoco
@@ -22,6 +24,8 @@ _SHININESS_SCALE, _AMBIENT_WITHOUT_LIGHTS = 128.0, 0.3
 
 # Points from which shadow rays start are lifted by this part of the model's extent, far above f32's rounding.
 _SHADOW_OFFSET = 1e-4
+
+_LOG = logging.getLogger(__name__)
 
 
 class RenderError(ValueError):
@@ -112,8 +116,9 @@ class RenderScene:
 def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1, 2)) -> RenderScene:
     """Returns the visible geoms, materials and lights of `mj_model`.
 
-    A geom is left out where its colour has alpha 0 or its group is not chosen; any other alpha counts as 1, also that
-    of textures. Of a material's textures that of the colour counts, of several skyboxes the first.
+    A geom is left out where its colour has alpha 0 or its group is not chosen; any other alpha counts as 1, with a
+    warning in the log, also that of textures. Of a material's textures that of the colour counts, of several
+    skyboxes the first.
 
     Args:
       mj_model: the compiled model.
@@ -132,6 +137,9 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
         )
     for geom in visible:
         _check_geom(mj_model, int(geom))
+    faint = [mj_model.geom(g).name or f"number {g}" for g in visible.tolist() if rgba[g, 3] < 1.0]
+    if faint:
+        _LOG.warning("drawn as if they were opaque, though their colour is not: geoms %s", ", ".join(faint))
     _check_soft(mj_model, geom_groups)
     kinds = mj_model.geom_type[visible]
     ids = visible[np.lexsort((kinds, np.isin(kinds, TRIANGLE_TYPES)))]
