@@ -120,7 +120,7 @@ def costs(cases: dict[str, peers.Case], size: int) -> dict[str, dict[str, float]
     for name, case in cases.items():
         seconds, memory = peers.compile_cost(case, size, has_shadows=True)
         result[name] = {"compile_seconds": seconds, "mib_per_image": memory}
-        print(f"{name:16s} {size:4d} px  compiled in {seconds:.1f} s, {memory:.2f} MiB an image", flush=True)
+        print(f"{name:18s} {size:4d} px  compiled in {seconds:.1f} s, {memory:.2f} MiB an image", flush=True)
     return result
 
 
@@ -129,7 +129,8 @@ def run(arguments: argparse.Namespace) -> None:
     jax.config.update("jax_enable_compilation_cache", False)
     rows: list[Row] = []
     largest = max(arguments.batch)
-    compiled = costs({"project": peers.project_case(largest), "5000 faces": peers.mesh_case(5000, largest)}, 128)
+    lit = {f"{faces} faces, lamp": peers.mesh_case(faces, largest, has_lamp=True) for faces in (5000, 20000)}
+    compiled = costs({"project": peers.project_case(largest), **lit}, 128)
     for batch in arguments.batch:
         cases = {"project": peers.project_case(batch)}
         cases |= {f"{faces} faces": peers.mesh_case(faces, batch) for faces in (5000, 20000)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import time
 from collections.abc import Callable
@@ -28,7 +29,7 @@ class Case:
     """A model in its initial pose, and cameras around it.
 
     Attributes:
-      model: with a camera `eye`.
+      model: the compiled scene.
       data: of `model`.
       positions: f64[B, 3] m.
       rotations: f64[B, 3, 3], camera to world.
@@ -40,8 +41,11 @@ class Case:
     rotations: np.ndarray
 
 
-def mesh_case(num_faces: int, batch: int) -> Case:
-    """Returns a lumpy ball of about `num_faces` faces that covers a quarter of a square image, alone."""
+def mesh_case(num_faces: int, batch: int, has_lamp: bool = False) -> Case:
+    """Returns a lumpy ball of about `num_faces` faces that covers a quarter of a square image, alone.
+
+    Without the lamp, whose light the ball shades from itself, there is the headlight only.
+    """
     count = round((num_faces / 8) ** 0.5) + 1  # trimesh makes about 8 count^2 faces of them
     ball = trimesh.creation.uv_sphere(radius=1.0, count=[count, 2 * count])
     x, y, z = ball.vertices.T
@@ -49,6 +53,10 @@ def mesh_case(num_faces: int, batch: int) -> Case:
     spec = mujoco.MjSpec()
     spec.add_mesh(name="ball", uservert=vertices.reshape(-1), userface=ball.faces.reshape(-1))
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="ball", rgba=[0.8, 0.5, 0.3, 1.0])
+    if has_lamp:
+        spec.worldbody.add_light(
+            pos=[0.5, 0.3, 1.0], dir=[-0.5, -0.3, -1.0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        )
     # A disc that covers a quarter of the square has a radius of 0.28 of its edge.
     return _around(spec, np.zeros(3), 0.1 / (2 * 0.28 * np.tan(FOVY / 2)), batch)
 
@@ -125,11 +133,14 @@ def multi_ray(case: Case, size: int) -> Callable[[], object]:
     directions, count = _directions(case, size), size * size
     pool = ThreadPoolExecutor(os.cpu_count())
 
+    # It keeps what it sorts out on the stack of the data, so that each thread needs its own.
+    own = [copy.copy(case.data) for _ in directions]
+
     def one(index: int) -> tuple[np.ndarray, np.ndarray]:
         ids, distances = np.zeros(count, np.int32), np.zeros(count)
         origin, rays = case.positions[index], directions[index].reshape(-1)
         args = (origin, rays, None, True, -1, ids, distances, None, count, mujoco.mjMAXVAL)
-        mujoco.mj_multiRay(case.model, case.data, *args)  # it releases the interpreter's lock
+        mujoco.mj_multiRay(case.model, own[index], *args)  # it releases the interpreter's lock
         return ids, distances
 
     return lambda: list(pool.map(one, range(len(directions))))

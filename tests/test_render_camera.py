@@ -128,3 +128,11 @@ def test_a_colour_that_is_not_opaque_is_told_of(caplog):
     text = CAMERAS.replace('<geom size=".5"/>', '<geom name="glass" size=".5" rgba="1 0 0 .4"/>')
     render.compile_scene(mujoco.MjModel.from_xml_string(text))
     assert "drawn as if they were opaque" in caplog.text and "glass" in caplog.text
+
+
+@pytest.mark.parametrize("size", [(0, 8), (8, 40_000)])
+def test_a_size_out_of_range_is_named(model, data, size):
+    frames = render.poses(data)
+    eye = render.camera(frames, model, "plain")
+    with pytest.raises(render.RenderError, match=r"size is \(.*; allowed: height and width from 1 to 32767"):
+        render.render(render.compile_scene(model), frames, eye, size)

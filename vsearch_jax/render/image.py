@@ -32,6 +32,8 @@ from vsearch_jax.types import Camera, Image
 # Height and width of the part of an image that is drawn at a time on a CPU: the some forty planes of a batch of such
 # parts stay in its cache, and a part meets fewer geoms than the whole.
 _CPU_TILE = (32, 64)
+# Along an edge of an image: columns and rows of a face are kept in 16 bits.
+_MOST_PIXELS = 2**15 - 1
 
 
 # Slopes of the rays of one part of the image, f32[1, w] and f32[h, 1], and the faces seen there.
@@ -52,10 +54,11 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
     """Returns what `camera` sees.
 
     Depth and geom_id are those of C MuJoCo's `mj_ray` through the pixels' centres; colours follow MuJoCo's light model,
-    evaluated in every pixel, with sharp shadows: those of primitives are exact, those of meshes and height fields to
-    about a pixel. There is no near or far plane. Light and camera belong outside of all solids: a wall seen from inside
-    is lit as from outside, and shadows in there are not right. Derivatives are those of the geom that each pixel shows:
-    finite, and blind to outlines and to the edges of shadows.
+    evaluated in every pixel, with sharp shadows: those of primitives are exact, those of meshes and height fields as
+    fine as one map of as many cells as the image has pixels, for the part of all of them that is seen. There is no near
+    or far plane. Light and camera belong outside of all solids: a wall seen from inside is lit as from outside, and
+    shadows in there are not right. Derivatives are those of the geom that each pixel shows: finite, and blind to
+    outlines and to the edges of shadows.
 
     Args:
       scene: RenderScene.
@@ -65,8 +68,14 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
       size: height and width in pixels, static.
 
     Returns:
-      Image of that size. What is not used of it costs nothing inside jit.
+      Image of that size. What is not used of it costs nothing inside jit. Its depth is NaN where meshes cover the image
+      so many times that the pairs of face and pixel can't be counted in 31 bits.
+
+    Raises:
+      RenderError: an edge of the image has no pixel or more than 32,767.
     """
+    if not all(0 < count <= _MOST_PIXELS for count in size):
+        raise RenderError(f"size is {size}; allowed: height and width from 1 to {_MOST_PIXELS}")
     # A GPU would rather have everything at once. A program exported to another platform is right there, if slower.
     part = _CPU_TILE if jax.default_backend() == "cpu" else size
     tiling = Tiling(size, (min(part[0], size[0]), min(part[1], size[1])))

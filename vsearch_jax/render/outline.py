@@ -39,6 +39,7 @@ def soft_silhouette(
 
     Where a surface turns away from the eye, its points and its outline move alike across the image, so the outline
     follows the points seen next to it. That holds for what the geoms' poses and the camera do, and to first order.
+    Where something stands before the geoms, the edge of what is seen of them counts as theirs too.
 
     Args:
       scene: RenderScene.
@@ -46,7 +47,7 @@ def soft_silhouette(
       camera: Camera.
       size: height and width in pixels, static.
       geom_ids: MuJoCo's numbers of the geoms, static.
-      softness: pixels over which the value goes from 0.27 outside to 0.73 inside.
+      softness: pixels from the outline, 0.5, to 0.27 outside of it and 0.73 inside.
 
     Returns:
       f32[H, W]: 0 and 1 more than three pixels from the outline, a logistic function of the distance nearer to it.

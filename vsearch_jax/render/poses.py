@@ -29,7 +29,10 @@ class Poses(NamedTuple):
 
 
 def poses(data: Any) -> Poses:
-    """Returns the poses of `data`, a mujoco.MjData after mj_forward or an mjx.Data after its kinematics."""
+    """Returns the poses of `data`, a mujoco.MjData after mj_forward or an mjx.Data.
+
+    MJX fills the poses of geoms in `mjx.kinematics`, those of cameras in `mjx.camlight`, after `mjx.com_pos`.
+    """
 
     def read(position: Any, rotation: Any) -> tuple[Array, Array]:
         return jnp.asarray(position, jnp.float32), jnp.asarray(rotation, jnp.float32).reshape(-1, 3, 3)

@@ -25,6 +25,8 @@ _NEAR = 1e-6
 _SLACK = 1e-3
 # Pairs of face and pixel that are tested at a time.
 _PART = 4096
+# Less than 2^31 by what a sum in f32 may be off.
+_MOST_PAIRS = 2.1e9
 
 
 class Pinhole(NamedTuple):
@@ -227,6 +229,9 @@ def rasterize(triangles: Triangles, view: View, size: tuple[int, int], zero: Arr
       view: View.
       size: height and width in pixels, each at most 32,767, static.
       zero: see `boundary.materialize`.
+
+    Returns:
+      Raster, its depth NaN where there are more pairs of face and pixel than 31 bits can count.
     """
     columns, rows = _rectangles(triangles, view, size, zero)
     count = ((columns >> 16) - (columns & 0xFFFF)) * ((rows >> 16) - (rows & 0xFFFF))
@@ -236,4 +241,5 @@ def rasterize(triangles: Triangles, view: View, size: tuple[int, int], zero: Arr
     initial = (jnp.zeros_like(zero), jnp.full(num_pixels, jnp.inf, jnp.float32), jnp.zeros(num_pixels, jnp.int32))
     step = functools.partial(_test_part, triangles, view, pairs, (size, zero))
     _, depth, face = jax.lax.while_loop(functools.partial(_is_left, pairs), step, initial)
+    depth = jnp.where(jnp.sum(count.astype(jnp.float32)) < _MOST_PAIRS, depth, jnp.nan)
     return Raster(depth.reshape(size), face.reshape(size))

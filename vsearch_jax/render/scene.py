@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjtGeom, mjtLightType, mjtObj
+from mujoco import mjtGeom, mjtLightType, mjtObj, mjtTexture
 
 from vsearch_jax.render.rays import RAY_FUNCTIONS
 from vsearch_jax.render.textures import Textures, compile_textures, rgb_texture
@@ -141,6 +141,8 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
     if faint:
         _LOG.warning("drawn as if they were opaque, though their colour is not: geoms %s", ", ".join(faint))
     _check_soft(mj_model, geom_groups)
+    for sky in np.flatnonzero(mj_model.tex_type == mjtTexture.mjTEXTURE_SKYBOX)[:1]:
+        _check_texture(mj_model, int(sky), "the sky")
     kinds = mj_model.geom_type[visible]
     ids = visible[np.lexsort((kinds, np.isin(kinds, TRIANGLE_TYPES)))]
     lights = _compile_lights(mj_model)
@@ -193,9 +195,14 @@ def _check_geom(model: mujoco.MjModel, geom: int) -> None:
             "give it alpha 0 or leave out its group"
         )
     texture = rgb_texture(model, geom)
-    if texture >= 0 and model.tex_nchannel[texture] not in (3, 4):
+    if texture >= 0:
+        _check_texture(model, texture, name)
+
+
+def _check_texture(model: mujoco.MjModel, texture: int, wearer: str) -> None:
+    if model.tex_nchannel[texture] not in (3, 4):
         raise RenderError(
-            f"{name} has the texture {model.tex(texture).name!r} of {model.tex_nchannel[texture]} channels, "
+            f"{wearer} has the texture {model.tex(texture).name!r} of {model.tex_nchannel[texture]} channels, "
             "which cannot be rendered; give it three"
         )
 

@@ -130,7 +130,8 @@ def nearest(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
     """Returns the nearest primitive of each pixel.
 
     The row number stands in the low bits of the depth's bit pattern. Bit patterns order as the depths do, so that one
-    minimum finds both.
+    minimum finds both. Surfaces nearer to one another than these bits tell, 1e-5 of their depth with 64 primitives and
+    1e-4 with 1,000, may be mistaken for one another.
 
     Args:
       scene: shapes.
