@@ -6,15 +6,18 @@ over the capsule's axis; it is convex there, so a golden section finds it.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
 
 from vsearch_jax import shapes
+from vsearch_jax.kinematics import Placement, build_placement, rotate
 from vsearch_jax.levers import extent_from_still_point, lever_arms
 from vsearch_jax.shapes import Vector
 
@@ -26,19 +29,19 @@ NEVER_NEAR = 0.05
 
 @flax.struct.dataclass
 class Solids:
-    """Pairs of a capsule and a solid; N pairs.
+    """Pairs of a capsule and a solid that stands still; N pairs.
 
     Attributes:
       capsule: i32[N], row of `Pairs.geom`.
-      geom: i32[N], the solid's geom.
-      center: f32[N, 3] m, the solid's middle in the geom's frame.
+      position: f32[N, 3] m, the solid's middle in world.
+      rotation: f32[N, 3, 3], of the solid, to world.
       size: f32[N, 3] m: half sizes of a box, radii of an ellipsoid, radius and half length of a cylinder.
       is_cylinder: bool[N].
     """
 
     capsule: Array
-    geom: Array
-    center: Array
+    position: Array
+    rotation: Array
     size: Array
     is_cylinder: Array
 
@@ -52,6 +55,8 @@ class Pairs:
       center: f32[C, 3] m, the capsule's middle in the geom's frame.
       half_axis: f32[C, 3] m, from the middle to one end of the axis, in the geom's frame.
       radius: f32[C] m.
+      placement: Placement of the capsules themselves, `center` included, for callers who have no poses of geoms.
+      frame_half_axis: f32[C, 3] m, `half_axis` in the frame of `placement`.
       table: i32[M], capsules that must stay above the table.
       first: i32[P], one of each pair of capsules.
       second: i32[P], the other one.
@@ -65,6 +70,8 @@ class Pairs:
     center: Array
     half_axis: Array
     radius: Array
+    placement: Placement
+    frame_half_axis: Array
     table: Array
     first: Array
     second: Array
@@ -113,23 +120,27 @@ def build_pairs(
         table = [g for g in table if _lowest(model, data, g) < NEVER_NEAR]
     in_order = [*((g, None) for g in table), *round_pairs, *blocks, *ellipsoids]
     arms = lever_arms(model, data, joints)
+    placement = jax.tree.map(lambda leaf: leaf[np.asarray(capsules)], build_placement(model, data, "geom"))
+    center, half_axis = (jnp.asarray([hull[i] for hull in hulls], jnp.float32) for i in range(2))
     return Pairs(
         geom=jnp.asarray(capsules, jnp.int32),
-        center=jnp.asarray([hull[0] for hull in hulls], jnp.float32),
-        half_axis=jnp.asarray([hull[1] for hull in hulls], jnp.float32),
+        center=center,
+        half_axis=half_axis,
         radius=jnp.asarray([hull[2] for hull in hulls], jnp.float32),
+        placement=placement.replace(position=placement.position + rotate(placement.rotation, center)),
+        frame_half_axis=rotate(placement.rotation, half_axis),
         table=jnp.asarray([row[g] for g in table], jnp.int32),
         first=jnp.asarray([row[a] for a, _ in round_pairs], jnp.int32),
         second=jnp.asarray([row[b] for _, b in round_pairs], jnp.int32),
-        blocks=_solids(model, blocks, row),
-        ellipsoids=_solids(model, ellipsoids, row),
+        blocks=_solids(model, data, blocks, row),
+        ellipsoids=_solids(model, data, ellipsoids, row),
         part=jnp.asarray([_part(geoms, b) for _, b in in_order], jnp.int32),
         levers=jnp.asarray([_relative_levers(arms, a, b) for a, b in in_order], jnp.float32).reshape(-1, len(joints)),
     )
 
 
 def gaps(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> Array:
-    """Returns the signed distance f32[N] in m of each pair.
+    """Returns the signed distance f32[N] in m of each pair, from the poses of the geoms.
 
     Args:
       pairs: what must not touch.
@@ -140,16 +151,26 @@ def gaps(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) 
     rotation = geom_xmat[pairs.geom]
     middle = shapes.turned(rotation, shapes.planes(pairs.center))
     center = shapes.along(middle, jnp.ones_like(pairs.radius), shapes.planes(geom_xpos[pairs.geom]))
-    half_axis = shapes.turned(rotation, shapes.planes(pairs.half_axis))
+    return _gaps(pairs, center, shapes.turned(rotation, shapes.planes(pairs.half_axis)), table_height)
+
+
+def gaps_from_frames(pairs: Pairs, rotations: Array, positions: Array, table_height: Array) -> Array:
+    """Returns what `gaps` does, from the frames of the joints (see `kinematics.frames`): less work, nothing else."""
+    rotation = rotations[pairs.placement.frame]
+    center = positions[pairs.placement.frame] + rotate(rotation, pairs.placement.position)
+    half_axis = rotate(rotation, pairs.frame_half_axis)
+    return _gaps(pairs, shapes.planes(center), shapes.planes(half_axis), table_height)
+
+
+def _gaps(pairs: Pairs, center: Vector, half_axis: Vector, table_height: Array) -> Array:
     lowest = center[2] - jnp.abs(half_axis[2]) - pairs.radius
     first, second = pairs.first, pairs.second
     apart = shapes.segment_distance(*(_rows(v, i) for i in (first, second) for v in (center, half_axis)))
 
     def solid(solids: Solids) -> tuple[Vector, Vector]:
-        turn = geom_xmat[solids.geom]
-        offset = shapes.minus(_rows(center, solids.capsule), shapes.planes(geom_xpos[solids.geom]))
-        local = shapes.minus(shapes.turned_back(turn, offset), shapes.planes(solids.center))
-        return local, shapes.turned_back(turn, _rows(half_axis, solids.capsule))
+        offset = shapes.minus(_rows(center, solids.capsule), shapes.planes(solids.position))
+        turned_back = functools.partial(shapes.turned_back, solids.rotation)
+        return turned_back(offset), turned_back(_rows(half_axis, solids.capsule))
 
     blocks, ellipsoids = pairs.blocks, pairs.ellipsoids
     block_size, radii = shapes.planes(blocks.size), shapes.planes(ellipsoids.size)
@@ -239,15 +260,17 @@ def _enclosing_capsule(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np
     return center, half_axis, float(np.hypot(*others))
 
 
-def _solids(model: mujoco.MjModel, pairs: list[tuple[int, int]], row: dict[int, int]) -> Solids:
+def _solids(model: mujoco.MjModel, data: mujoco.MjData, pairs: list[tuple[int, int]], row: dict[int, int]) -> Solids:
     geoms = np.array([b for _, b in pairs], dtype=np.int32)
     kinds = model.geom_type[geoms]
     is_exact = np.isin(kinds, (int(GEOM.mjGEOM_CYLINDER), int(GEOM.mjGEOM_ELLIPSOID)))[:, None]
     box = model.geom_aabb[geoms]
+    rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    center = np.where(is_exact, 0.0, box[:, :3])
     return Solids(
         capsule=jnp.asarray([row[a] for a, _ in pairs], jnp.int32),
-        geom=jnp.asarray(geoms),
-        center=jnp.asarray(np.where(is_exact, 0.0, box[:, :3]), jnp.float32),
+        position=jnp.asarray(data.geom_xpos[geoms] + np.einsum("nij,nj->ni", rotation, center), jnp.float32),
+        rotation=jnp.asarray(rotation, jnp.float32),
         size=jnp.asarray(np.where(is_exact, model.geom_size[geoms], box[:, 3:]), jnp.float32),
         is_cylinder=jnp.asarray(kinds == int(GEOM.mjGEOM_CYLINDER)),
     )
