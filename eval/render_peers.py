@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import queue
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -134,13 +135,17 @@ def multi_ray(case: Case, size: int) -> Callable[[], object]:
     pool = ThreadPoolExecutor(os.cpu_count())
 
     # It keeps what it sorts out on the stack of the data, so that each thread needs its own.
-    own = [copy.copy(case.data) for _ in directions]
+    free: queue.SimpleQueue[mujoco.MjData] = queue.SimpleQueue()
+    for _ in range(os.cpu_count() or 1):
+        free.put(copy.copy(case.data))
 
     def one(index: int) -> tuple[np.ndarray, np.ndarray]:
         ids, distances = np.zeros(count, np.int32), np.zeros(count)
         origin, rays = case.positions[index], directions[index].reshape(-1)
         args = (origin, rays, None, True, -1, ids, distances, None, count, mujoco.mjMAXVAL)
-        mujoco.mj_multiRay(case.model, own[index], *args)  # it releases the interpreter's lock
+        data = free.get()
+        mujoco.mj_multiRay(case.model, data, *args)  # it releases the interpreter's lock
+        free.put(data)
         return ids, distances
 
     return lambda: list(pool.map(one, range(len(directions))))
