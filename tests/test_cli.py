@@ -198,6 +198,24 @@ def test_a_home_that_does_not_exist_is_named(capsys: pytest.CaptureFixture[str],
     )
 
 
+def test_the_last_preset_counts(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert cli.parse(["train", "--preset", "cpu", "--preset=smoke", "--out", "x"]).config == Config.preset("smoke")
+    out = str(tmp_path / "run")
+    assert "unknown preset 'big'" in fails(capsys, "train", "--preset", "smoke", "--preset", "big", "--out", out)
+
+
+@pytest.mark.parametrize("seed", ["x", -1, 2**32, None])
+def test_a_damaged_seed_is_found_before_anything_runs(
+    quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path, seed: Any
+) -> None:
+    runner.start(tmp_path, Config.preset("smoke"), seed=0)
+    values = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(values | {"seed": seed}))
+    before = contents(tmp_path)
+    assert "config.json: seed is" in fails(capsys, "train", "--out", str(tmp_path), "--resume")
+    assert contents(tmp_path) == before
+
+
 def test_an_unfinished_run_is_not_evaluated(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     config = Config.preset("smoke")
     runner.start(tmp_path / "run", config, seed=0)

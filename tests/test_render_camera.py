@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from jaxlie import SE3
 
 from vsearch_jax import render
 from vsearch_jax.render.camera import pinhole, pixel_rays
@@ -136,3 +138,20 @@ def test_a_size_out_of_range_is_named(model, data, size):
     eye = render.camera(frames, model, "plain")
     with pytest.raises(render.RenderError, match=r"size is \(.*; allowed: height and width from 1 to 32767"):
         render.render(render.compile_scene(model), frames, eye, size)
+
+
+def test_cameras_at_a_batch_of_poses(model, data):
+    scene, frames = render.compile_scene(model), render.poses(data)
+    poses = SE3.from_translation(jnp.array([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0]]))
+    matrix = np.array([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])
+    draw = jax.jit(jax.vmap(lambda camera: render.render(scene, frames, camera, SIZE).geom_id))
+    by_angle = draw(render.camera_from_pose(poses, fovy=2.0 * np.arctan(12.0 / 20.0)))
+    by_matrix = draw(render.camera_from_matrix(poses, matrix))
+    assert by_angle.shape == (2, *SIZE) and 0 < (by_angle[0] >= 0).sum() != (by_angle[1] >= 0).sum()
+    np.testing.assert_array_equal(by_angle, by_matrix)
+
+
+@pytest.mark.parametrize("fovy", [45, 0.0, float("nan")])
+def test_a_field_of_view_in_degrees_is_named(fovy):
+    with pytest.raises(render.RenderError, match=r"fovy is .*; allowed: between 0 and pi, in rad"):
+        render.camera_from_pose(SE3.identity(), fovy)

@@ -147,7 +147,8 @@ def _read(run: Path, step: int, item: str, arguments: ocp.args.CheckpointArgs) -
         raise
     except Exception as error:  # a damaged file shows as any of a dozen types, from JSON's to tensorstore's
         earlier = [other for other in _steps(run) if other < step]
-        remedy = f"delete this folder to go on from {max(earlier)}" if earlier else "there is no other; train anew"
+        again = f"delete that folder and go on from {max(earlier, default=0)}: vsearch train --out {run} --resume"
+        remedy = again if earlier else "there is no other; train anew"
         raise CheckpointError(f"checkpoint {folder} is damaged ({_first_line(error)}); {remedy}") from error
 
 

@@ -72,12 +72,13 @@ def _starting_config(arguments: Sequence[str]) -> Config:
 
 
 def _value_of(option: str, arguments: Sequence[str]) -> str | None:
+    value = None
     for i, argument in enumerate(arguments):
         if argument == option:
-            return next(iter(arguments[i + 1 :]), None)
-        if argument.startswith(f"{option}="):
-            return argument.partition("=")[2]
-    return None
+            value = next(iter(arguments[i + 1 :]), None)
+        elif argument.startswith(f"{option}="):
+            value = argument.partition("=")[2]
+    return value  # of the last one, as tyro has it
 
 
 def _with_shortcuts(command: Train) -> Train:

@@ -24,6 +24,10 @@ METRICS = "metrics.jsonl"
 EVENTS = "tensorboard"
 
 
+MOST_SEED = 2**32 - 1
+"""Seeds are numbers of 32 bits: jax would cut a larger one, and two seeds would be one."""
+
+
 class RunError(ValueError):
     """A run's folder is in the way, missing or incomplete; the message says which and what to do."""
 
@@ -35,7 +39,8 @@ def claim(folder: Path) -> None:
       RunError: the folder holds something, or a file stands in its place.
     """
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        hint = ", or go on with the run in it by --resume" if (folder / CONFIG).is_file() else ""
+        is_run = (folder / CONFIG).is_file()
+        hint = f", or go on with the run in it: vsearch train --out {folder} --resume" if is_run else ""
         raise RunError(f"{folder} exists; name another folder with --out{hint}")
     folder.mkdir(parents=True, exist_ok=True)
 
@@ -112,8 +117,8 @@ def read_config(run: Path) -> Config:
 def read_seed(run: Path) -> int:
     """Returns the seed of the run in the folder `run`; raises as `read_config`."""
     seed = _read(run).get("seed")
-    if not isinstance(seed, int):
-        raise ConfigError(f"{run / CONFIG}: seed is {seed!r}, not a whole number; {_REPAIR}")
+    if not isinstance(seed, int) or not 0 <= seed <= MOST_SEED:
+        raise ConfigError(f"{run / CONFIG}: seed is {seed!r}, no whole number from 0 to {MOST_SEED}; {_REPAIR}")
     return seed
 
 

@@ -28,9 +28,6 @@ from vsearch_jax.run_folder import RunError
 from vsearch_jax.training import init, train
 from vsearch_jax.types import TrainState
 
-MOST_SEED = 2**32 - 1
-"""Seeds are numbers of 32 bits."""
-
 T = TypeVar("T")
 
 
@@ -44,8 +41,8 @@ def start(run: Path, config: Config, seed: int) -> TrainState:
       ConfigError, SceneError: the config or the seed can't be run.
       OSError: the disk is full or not writable.
     """
-    if not 0 <= seed <= MOST_SEED:  # jax would cut it to 32 bits, and two seeds would be one
-        raise ConfigError(f"seed is {seed}; allowed: 0 to {MOST_SEED}")
+    if not 0 <= seed <= run_folder.MOST_SEED:
+        raise ConfigError(f"seed is {seed}; allowed: 0 to {run_folder.MOST_SEED}")
     with run_folder.claimed(run):
         state = in_thread(init, jax.random.key(seed), config)
         check_target(state.reach, config)  # now, not when the training is done
@@ -62,12 +59,12 @@ def resume(run: Path, config: Config) -> TrainState:
       CheckpointError: the checkpoint is missing, damaged or of another config.
       ConfigError: the arm can't reach the target view.
     """
-    saved = run_folder.read_config(run)
+    saved, seed = run_folder.read_config(run), run_folder.read_seed(run)
     template = jax.eval_shape(lambda key: init(key, config), jax.random.key(0))
     state = checkpoint.restore(run, template, config)
     check_target(state.reach, config)
     if saved != config:  # in what only evaluation reads
-        run_folder.write_config(run, config, run_folder.read_seed(run))
+        run_folder.write_config(run, config, seed)
     return state
 
 

@@ -99,7 +99,8 @@ def _from_dict(cls: type, values: dict[str, Any]) -> Any:
         if dataclasses.is_dataclass(hint) and isinstance(value, dict):
             value = _from_dict(hint, value)  # pyright: ignore[reportArgumentType] # a hint that is a dataclass is a type
         elif not _fits(value, hint):
-            raise ConfigError(f"{cls.__name__}.{name} is {value!r}; allowed: {getattr(hint, '__name__', hint)}")
+            allowed = str(hint).replace("typing.", "") if get_args(hint) else getattr(hint, "__name__", hint)
+            raise ConfigError(f"{cls.__name__}.{name} is {value!r}; allowed: {allowed}")
         arguments[name] = value
     return cls(**arguments)
 

@@ -55,29 +55,41 @@ def _intrinsics(mj_model: mujoco.MjModel, camera_id: int, size: tuple[int, int] 
 
 
 def camera_from_pose(T_world_camera: SE3, fovy: Array | float) -> Camera:
-    """Returns the camera at a pose.
+    """Returns the camera at a pose, or a batch of them at a batch of poses.
 
     Args:
-      T_world_camera: pose of the camera, which looks along its own -z with +y up.
-      fovy: f32[] rad, vertical field of view.
+      T_world_camera: pose of the camera, which looks along its own -z with +y up; batch axes lead.
+      fovy: f32[] or f32[*batch] rad, vertical field of view.
+
+    Raises:
+      RenderError: `fovy` is a Python number that is no angle between 0 and pi.
     """
+    if isinstance(fovy, (int, float)) and not 0.0 < fovy < np.pi:
+        raise RenderError(f"fovy is {fovy:g}; allowed: between 0 and pi, in rad")
+    return _at_pose(T_world_camera, jnp.asarray(fovy, jnp.float32), None)
+
+
+def _at_pose(T_world_camera: SE3, fovy: Array, intrinsics: Array | None) -> Camera:
+    batch = T_world_camera.get_batch_axes()
     return Camera(
         position=T_world_camera.translation(),
         rotation=T_world_camera.rotation().as_matrix(),
-        fovy=jnp.asarray(fovy, dtype=jnp.float32),
+        fovy=jnp.broadcast_to(fovy, batch),
+        intrinsics=None if intrinsics is None else jnp.broadcast_to(intrinsics, (*batch, 4)),
     )
 
 
 def camera_from_matrix(T_world_camera: SE3, matrix: Array) -> Camera:
-    """Returns the camera with a calibrated camera's matrix.
+    """Returns the camera with a calibrated camera's matrix, or a batch of them at a batch of poses.
 
     Args:
       T_world_camera: pose of the camera, which looks along its own -z with +y up. OpenCV's looks along +z with +y down:
         turn its pose by pi around its x axis.
-      matrix: f32[3, 3] pixels, ((fx, 0, cx), (0, fy, cy), (0, 0, 1)), for the size of the images that are drawn.
+      matrix: f32[3, 3] or f32[*batch, 3, 3] pixels, ((fx, 0, cx), (0, fy, cy), (0, 0, 1)), for the size of the images
+        that are drawn.
     """
-    intrinsics = jnp.stack([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]).astype(jnp.float32)
-    return camera_from_pose(T_world_camera, 0.0).replace(intrinsics=intrinsics)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
+    rows, columns = np.array([0, 1, 0, 1]), np.array([0, 1, 2, 2])
+    return _at_pose(T_world_camera, jnp.float32(0.0), matrix[..., rows, columns].astype(jnp.float32))
 
 
 def magnified(camera: Camera, factor: int) -> Camera:
