@@ -20,6 +20,7 @@ from render_oracles import (
     reached_by_light,
 )
 from vsearch_jax import render
+from vsearch_jax.render import raster
 from vsearch_jax.render.triangles import compile_triangles
 
 SIZE = (48, 64)
@@ -79,6 +80,16 @@ def test_a_face_below_the_camera_and_behind_it_is_seen() -> None:
     assert (np.asarray(image.geom_id) == ids).mean() > 0.999
     is_same = (np.asarray(image.geom_id) == ids) & (ids == 0)
     np.testing.assert_allclose(np.asarray(image.depth)[is_same], depth[is_same], rtol=1e-4)
+
+
+def test_more_pairs_than_can_be_counted_are_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = _potato_model()
+    data = forward(model)
+    frames, scene = poses(model, data), render.compile_scene(model)
+    eye = render.camera(frames, model, "eye")
+    monkeypatch.setattr(raster, "_MOST_PAIRS", 100.0)
+    depth = jax.jit(lambda eye: render.render(scene, frames, eye, SIZE).depth)(eye)
+    assert np.isnan(depth).all()
 
 
 def test_normals_are_those_of_mj_multi_ray() -> None:

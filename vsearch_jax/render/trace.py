@@ -164,7 +164,7 @@ def poses(frames: Frames, start: int) -> Array:
 def nearer(scene: RenderScene, hits: Hits, raster: Raster) -> Hits:
     """Returns the hits with those faces of `raster` that are nearer."""
     assert scene.triangles is not None
-    is_nearer = raster.depth < jnp.where(hits.is_hit, hits.depth, jnp.inf)
+    is_nearer = ~(raster.depth >= jnp.where(hits.is_hit, hits.depth, jnp.inf))  # also of NaN, which is to be seen
     geom = scene.triangles.geom.at[raster.face].get(mode="promise_in_bounds")
     return Hits(
         jnp.where(is_nearer, scene.num_primitives + geom, hits.slot),
