@@ -172,9 +172,12 @@ _coordinate = st.floats(-0.5, 0.5, width=32)
 _point = st.tuples(_coordinate, _coordinate, _coordinate).map(lambda p: jnp.asarray(p, jnp.float32))
 _size = st.tuples(*[st.floats(0.01, 0.3)] * 3).map(lambda s: jnp.asarray(s, jnp.float32))
 _SOLIDS = {
-    "box": (mujoco.mjtGeom.mjGEOM_BOX, lambda p, s: shapes.block_distance(p, s, jnp.asarray(False))),
-    "cylinder": (mujoco.mjtGeom.mjGEOM_CYLINDER, lambda p, s: shapes.block_distance(p, s, jnp.asarray(True))),
-    "ellipsoid": (mujoco.mjtGeom.mjGEOM_ELLIPSOID, shapes.ellipsoid_distance),
+    "box": (mujoco.mjtGeom.mjGEOM_BOX, shapes.segment_box_distance),
+    "cylinder": (mujoco.mjtGeom.mjGEOM_CYLINDER, lambda c, h, s: shapes.segment_cylinder_distance(c, h, s[0], s[1])),
+    "ellipsoid": (
+        mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+        lambda c, h, s: shapes.least_along(lambda point: shapes.ellipsoid_distance(point, s), c, h),
+    ),
 }
 _PROBE = 1e-4
 
@@ -182,7 +185,7 @@ _PROBE = 1e-4
 @pytest.fixture(scope="module", params=list(_SOLIDS))
 def solid(request):
     kind, distance = _SOLIDS[request.param]
-    return kind, jax.jit(distance)
+    return kind, jax.jit(lambda c, h, s: distance(*(tuple(x[:, None]) for x in (c, h, s)))[0])
 
 
 @given(point=_point, size=_size)
@@ -195,11 +198,25 @@ def test_distance_of_a_point_from_a_solid_equals_mujoco(solid, point, size):
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     theirs = mujoco.mj_geomDistance(model, data, 0, 1, 10.0, None) + _PROBE
-    ours = float(distance(point, size))
+    ours = float(distance(point, jnp.zeros(3), size))
     if theirs > _PROBE:
         assert ours == pytest.approx(theirs, abs=2e-4)
     else:  # how deep a penetration is, MuJoCo only estimates
         assert ours < 2 * _PROBE
+
+
+@given(center=_point, half_axis=_point, size=_size)
+def test_distance_of_a_segment_from_a_solid_is_the_least_of_its_points(solid, center, half_axis, size):
+    kind, distance = solid
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return  # its distance has no short form to sample; the golden section is the same for any solid
+    points = np.asarray(center) + np.linspace(-1, 1, 2001)[:, None] * np.asarray(half_axis, float)
+    beyond = np.abs(points) - np.asarray(size)
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        beyond = np.stack([np.hypot(*points.T[:2]) - float(size[0]), np.abs(points[:, 2]) - float(size[1])], axis=1)
+    sampled = np.linalg.norm(np.maximum(beyond, 0.0), axis=1).min()
+    spacing = 0.5e-3 * np.linalg.norm(half_axis)
+    assert sampled - spacing - 5e-5 <= float(distance(center, half_axis, size)) <= sampled + 1e-6
 
 
 @given(a=_point, u=_point, b=_point, v=_point)

@@ -7,12 +7,16 @@ scan 2e-6 s. The likely reason: XLA fuses its unrolled chain of bodies and compu
 
 from __future__ import annotations
 
+import functools
+
 import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
+
+from vsearch_jax.batches import widened
 
 
 @flax.struct.dataclass
@@ -70,38 +74,41 @@ def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
 
     Args:
       joints: the J joints.
-      values: f32[J] rad or m, of the joints.
+      values: f32[J] rad or m, of the joints; they may have a batch axis more at the end, then the results have it too.
     """
-    count = joints.parent.shape[0]
-    start = (jnp.tile(jnp.eye(3), (count + 1, 1, 1)), jnp.zeros((count + 1, 3)))
-    (rotations, positions), (axes, anchors) = jax.lax.scan(
-        _next_frame, start, (joints, values - joints.reference, jnp.arange(1, count + 1))
+    count, wide = joints.parent.shape[0], functools.partial(widened, batch=values.ndim - 1)
+    axis, is_slide, rotation = wide(joints.axis), wide(joints.is_slide), wide(joints.rotation)
+    change = values - wide(joints.reference)
+    angle, offset = jnp.where(is_slide, 0.0, change), jnp.where(is_slide, change, 0.0)
+    # In the frames of the parents, all at once; what is left for the scan is to chain them.
+    shift = jnp.sum(rotation * axis[:, None], axis=2) * offset[:, None]
+    turned = jnp.sum(rotation[:, :, :, None] * _axis_rotations(axis, angle)[:, None], axis=2)
+    start = (
+        jnp.broadcast_to(wide(jnp.eye(3)), (count + 1, *turned.shape[1:])),
+        jnp.zeros((count + 1, *turned.shape[2:])),
     )
-    return rotations, positions, axes, anchors
+    steps = (joints.parent, turned, wide(joints.position) + shift, jnp.arange(1, count + 1))
+    (rotations, positions), _ = jax.lax.scan(_next_frame, start, steps)
+    axes = jnp.sum(rotations[1:] * axis[:, None], axis=2)
+    return rotations, positions, axes, positions[1:] - axes * offset[:, None]
 
 
-def _next_frame(
-    done: tuple[Array, Array], step: tuple[Joints, Array, Array]
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    (rotations, positions), (joint, value, index) = done, step
-    parent = rotations[joint.parent]
-    anchor = positions[joint.parent] + rotate(parent, joint.position)
-    rotation = matmul(parent, joint.rotation)
-    axis = rotate(rotation, joint.axis)
-    angle, offset = jnp.where(joint.is_slide, 0.0, value), jnp.where(joint.is_slide, value, 0.0)
-    rotation = matmul(rotation, _axis_rotation(joint.axis, angle))
-    done = (rotations.at[index].set(rotation), positions.at[index].set(anchor + axis * offset))
-    return done, (axis, anchor)
+def _next_frame(done: tuple[Array, Array], step: tuple[Array, Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
+    (rotations, positions), (parent, turned, position, index) = done, step
+    outer = rotations[parent]
+    rotation = jnp.sum(outer[:, :, None] * turned[None], axis=1)
+    position = positions[parent] + jnp.sum(outer * position[None], axis=1)
+    return (rotations.at[index].set(rotation), positions.at[index].set(position)), None
 
 
-def _axis_rotation(axis: Array, angle: Array) -> Array:
-    """Rodrigues' formula."""
-    x, y, z = axis
+def _axis_rotations(axis: Array, angle: Array) -> Array:
+    """Rodrigues' formula; f32[J, 3, 3, ...] from f32[J, 3, ...] and f32[J, ...]."""
+    x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     zero = jnp.zeros_like(x)
-    cross = jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
-    outer = axis[:, None] * axis[None, :]
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    return cosine * jnp.eye(3) + sine * cross + (1.0 - cosine) * outer
+    cross = jnp.stack([jnp.stack(row, axis=1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=1)
+    outer = axis[:, :, None] * axis[:, None, :]
+    cosine, sine = jnp.cos(angle)[:, None, None], jnp.sin(angle)[:, None, None]
+    return cosine * widened(jnp.eye(3)[None], angle.ndim - 1) + sine * cross + (1.0 - cosine) * outer
 
 
 def place(things: Placement, rotations: Array, positions: Array) -> tuple[Array, Array]:

@@ -19,8 +19,10 @@ Vector = tuple[Array, Array, Array]
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 # 0.618^14 = 1e-3 of the axis; near its minimum the distance changes by far less. The ends are looked at too.
 SEARCH_ITERATIONS = 14
+# Tangents from both ends of the bracket: what is left after these is some 0.03 mm, on the safe side.
+TANGENT_ITERATIONS = 6
 # Newton's steps from the left of a convex sum converge quadratically, and what is left shortens the distance.
-NEWTON_ITERATIONS = 4
+NEWTON_ITERATIONS = 6
 
 
 def planes(vectors: Array) -> Vector:
@@ -36,12 +38,6 @@ def dot(a: Vector, b: Vector) -> Array:
 def turned(rotation: Array, vector: Vector) -> Vector:
     """Returns `vector` turned by `rotation` (f32[..., 3, 3])."""
     x, y, z = (dot(planes(rotation[..., row, :]), vector) for row in range(3))
-    return x, y, z
-
-
-def turned_back(rotation: Array, vector: Vector) -> Vector:
-    """Returns `vector` turned by the inverse of `rotation` (f32[..., 3, 3])."""
-    x, y, z = (dot(planes(rotation[..., :, column]), vector) for column in range(3))
     return x, y, z
 
 
@@ -79,22 +75,82 @@ def segment_distance(center_a: Vector, half_a: Vector, center_b: Vector, half_b:
     return norm(along(along(offset, s, half_a), -t, half_b))
 
 
-def block_distance(point: Vector, size: Vector, is_cylinder: Array) -> Array:
-    """Returns the signed distance in m of a point from a box or a cylinder.
+def segment_box_distance(center: Vector, half_axis: Vector, size: Vector) -> Array:
+    """Returns the distance in m of a segment from a box, 0 where it passes through.
+
+    The squared distance is convex along the segment and quadratic between the points where it crosses the planes of
+    the faces. So its slope is a straight line between the last of them where it falls and the first where it rises.
 
     Args:
-      point: m, in the solid's frame.
-      size: m: half sizes of a box; radius and half length of a cylinder about z.
-      is_cylinder: bool.
+      center: m, the segment's middle in the box's frame.
+      half_axis: m, from the middle to one end.
+      size: m, half sizes of the box.
     """
-    x, y, z = point
-    # A cylinder is a rectangle in the half plane of the point; its third face is too deep to matter.
-    radial = jnp.sqrt(jnp.maximum(x * x + y * y, 1e-24))
-    first = jnp.where(is_cylinder, radial, jnp.abs(x)) - size[0]
-    second = jnp.where(is_cylinder, jnp.abs(z), jnp.abs(y)) - size[1]
-    third = jnp.where(is_cylinder, -jnp.inf, jnp.abs(z) - size[2])
-    outside = norm((jnp.maximum(first, 0.0), jnp.maximum(second, 0.0), jnp.maximum(third, 0.0)))
-    return outside + jnp.minimum(jnp.maximum(jnp.maximum(first, second), third), 0.0)
+
+    def outside(s: Array) -> Vector:
+        x, y, z = (x - jnp.clip(x, -h, h) for x, h in zip(along(center, s, half_axis), size, strict=True))
+        return x, y, z
+
+    low, high = jnp.full_like(center[0], -1.0), jnp.ones_like(center[0])
+    slope_first, slope_last = (dot(half_axis, outside(end)) for end in (low, high))
+    slope_low, slope_high = jnp.minimum(slope_first, 0.0), jnp.maximum(slope_last, 0.0)
+    for x, half, extent in zip(center, half_axis, size, strict=True):
+        inverse = 1.0 / jnp.where(jnp.abs(half) < 1e-9, 1e-9, half)
+        for face in (extent, -extent):
+            s = jnp.clip((face - x) * inverse, -1.0, 1.0)
+            slope = dot(half_axis, outside(s))
+            falls, rises = slope <= 0.0, slope >= 0.0
+            low, slope_low = _larger(low, s, falls), _larger(slope_low, slope, falls)
+            high, slope_high = -_larger(-high, -s, rises), -_larger(-slope_high, -slope, rises)
+    share = -slope_low / jnp.maximum(slope_high - slope_low, 1e-20)
+    s = low + (high - low) * jnp.clip(share, 0.0, 1.0)
+    s = jnp.where(slope_first >= 0.0, -1.0, jnp.where(slope_last <= 0.0, 1.0, s))
+    return norm(outside(s))
+
+
+def _larger(a: Array, b: Array, is_taken: Array) -> Array:
+    """Returns the larger of a and, where it is taken, b."""
+    return jnp.where(is_taken, jnp.maximum(a, b), a)
+
+
+def segment_cylinder_distance(center: Vector, half_axis: Vector, radius: Array, half_length: Array) -> Array:
+    """Returns the distance in m of a segment from a cylinder about z, or some 0.03 mm less; 0 where it passes through.
+
+    The distance is convex along the segment, so it lies above its tangents. Where those of the two ends of a bracket
+    meet is the next place to look (Kelley's cutting planes, in one dimension).
+
+    Args:
+      center: m, the segment's middle in the cylinder's frame.
+      half_axis: m, from the middle to one end.
+      radius: m.
+      half_length: m.
+    """
+
+    def at(s: Array) -> tuple[Array, Array, Array]:
+        x, y, z = along(center, s, half_axis)
+        radial = jnp.sqrt(jnp.maximum(x * x + y * y, 1e-24))
+        beside, above = jnp.maximum(radial - radius, 0.0), z - jnp.clip(z, -half_length, half_length)
+        distance = jnp.sqrt(jnp.maximum(beside * beside + above * above, 1e-24))
+        outward = (x * half_axis[0] + y * half_axis[1]) / radial
+        return s, distance, (beside * outward + above * half_axis[2]) / distance
+
+    def meeting(low: tuple[Array, Array, Array], high: tuple[Array, Array, Array]) -> Array:
+        (s_low, f_low, slope_low), (s_high, f_high, slope_high) = low, high
+        s = f_high - f_low + slope_low * s_low - slope_high * s_high
+        s = jnp.clip(s / jnp.minimum(slope_low - slope_high, -1e-9), s_low, s_high)
+        return jnp.where(slope_low >= 0.0, s_low, jnp.where(slope_high <= 0.0, s_high, s))
+
+    low, high = at(jnp.full_like(center[0], -1.0)), at(jnp.ones_like(center[0]))
+    for _ in range(TANGENT_ITERATIONS):
+        new = at(meeting(low, high))
+        falls = new[2] <= 0.0
+        low, high = (
+            jax.tree.map(functools.partial(jnp.where, is_replaced), new, end)
+            for is_replaced, end in ((falls, low), (~falls, high))
+        )
+    s = meeting(low, high)
+    bounds = [distance + slope * (s - place) for place, distance, slope in (low, high)]
+    return jnp.maximum(jnp.maximum(*bounds), 0.0)
 
 
 def ellipsoid_distance(point: Vector, size: Vector) -> Array:

@@ -68,7 +68,7 @@ class PlanningConfig:
     """Length in rad of a tree's random edges."""
     resolution: float = 0.004
     """How near in m the arm may pass before an edge is given up as blocked; see `planning.edge_is_free`."""
-    num_shortcuts: int = 96
+    num_shortcuts: int = 64
     """Attempts to shorten a path."""
     max_waypoints: int = 48
     """Configurations of a path, at most."""

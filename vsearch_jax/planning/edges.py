@@ -1,9 +1,4 @@
-"""Is the straight joint path between two configurations free? Proven by distances, not sampled.
-
-Where a pair of solids is d apart, no motion that shifts them by less than d against one another lets them touch. So two
-samples prove all between them free where, for every pair, their distances add up to more than the motion between them
-can take away (`Pairs.levers`). Far from everything a few samples do for a whole edge.
-"""
+"""Is the straight joint path between two configurations free? Proven (see `proofs`), after a look at a few samples."""
 
 from __future__ import annotations
 
@@ -14,27 +9,33 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax import collision, kinematics
+from vsearch_jax import collision
 from vsearch_jax.arm import Arm
+from vsearch_jax.batches import batch_last, widened
+from vsearch_jax.collision import Axes
 from vsearch_jax.config import PlanningConfig
+from vsearch_jax.planning.proofs import Bounds, Sample, is_free_between, look, motion_bounds, ways
 
-# A step this many times the distance is tried first: the next sample is mostly as far from everything as this one, and
-# 2 would need it to be no nearer at all. The safe step follows where that fails.
-BOLD = 1.8
+# A step is as long as if the next sample were nearly as far from everything as this one, and the speed the same. Where
+# that fails, a shorter one is tried, then one that is safe if the next sample is as near as the resolution.
+BOLD = (1.3, 0.7, 1.0)
+LAST_TRY = len(BOLD) - 1
 # Where an edge is looked at first: most of those that are blocked show it here, for a few samples instead of the dozens
-# that it takes to come up to what blocks them.
-PROBES = (1.0, 0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
+# that it takes to come up to what blocks them. The last two tell the speed at the start.
+PROBES = (1.0, 0.5, 0.25, 0.75, 0.375, 0.625, 0.875, 0.125, 0.0)
 
 
 class Edge(NamedTuple):
-    """A straight joint path that is being checked; N pairs.
+    """A straight joint path that is being checked; N pairs, C capsules.
 
     Attributes:
       start: f32[J] rad or m.
       change: f32[J] rad or m, from the start to the end.
       done: f32[] in [0, 1], the share of the path that is proven free.
-      gap: f32[N] m, distances there, or less.
-      boldness: f32[], factor of the next step.
+      sample: Sample there; the last probe until all are done, which ends there too.
+      speed: f32[C] m, that the capsules move on the whole edge at their present speed.
+      sink: f32[C] m, the same, but downward only.
+      num_tries: i32[], steps from there that could not be proven.
       num_probes: i32[], how many of the `PROBES` are done.
       is_blocked: bool[], a probe touches or the next step cannot be proven.
     """
@@ -42,16 +43,21 @@ class Edge(NamedTuple):
     start: Array
     change: Array
     done: Array
-    gap: Array
-    boldness: Array
+    sample: Sample
+    speed: Array
+    sink: Array
+    num_tries: Array
     num_probes: Array
     is_blocked: Array
 
 
 def edge_between(arm: Arm, start: Array, end: Array) -> Edge:
     """Returns the edge from `start` to `end` (f32[J] each), of which nothing is proven yet; the start must be free."""
-    gap = jnp.zeros(arm.planning_pairs.part.shape[0])
-    return Edge(start, end - start, jnp.float32(0.0), gap, jnp.float32(BOLD), jnp.int32(0), jnp.bool_(False))
+    pairs = arm.planning_pairs
+    still = jnp.zeros(pairs.radius.shape[0])
+    sample = Sample(jnp.zeros(pairs.part.shape[0]), Axes((still, still, still), (still, still, still)))
+    none = jnp.int32(0)
+    return Edge(start, end - start, jnp.float32(0.0), sample, still, still, none, none, jnp.bool_(False))
 
 
 def is_whole(edge: Edge) -> Array:
@@ -69,34 +75,57 @@ def reached(edge: Edge) -> Array:
     return edge.start + edge.done * edge.change
 
 
-def planning_gaps(arm: Arm, qpos: Array) -> Array:
-    """Returns f32[N] m, how far each of the planning pairs is from being too near, at `qpos` (f32[nq])."""
-    rotations, positions, _, _ = kinematics.frames(arm.joints, qpos[arm.joints.address])
+def advance(arm: Arm, edge: Edge, qpos: Array, config: PlanningConfig, count: int = 1) -> Edge:
+    """Returns the edge after `count` more probes or samples; `qpos` (f32[nq]) holds the joints that stay."""
+    advance_all = batch_last(functools.partial(_advance, config.resolution, count))
+    return advance_all(arm, (edge, qpos))
+
+
+def _advance(resolution: float, count: int, arm: Arm, item: tuple[Edge, Array]) -> Edge:
+    edge, qpos = item
+    bounds = motion_bounds(arm.planning_pairs, edge.change)
+    once = functools.partial(_advance_once, arm, qpos, bounds, resolution)
+    return jax.lax.fori_loop(0, count, lambda _, edge: once(edge), edge)
+
+
+def _advance_once(arm: Arm, qpos: Array, bounds: Bounds, resolution: float, edge: Edge) -> Edge:
     pairs = arm.planning_pairs
-    gap = collision.gaps_from_frames(pairs, rotations, positions, arm.table_height)
-    return gap - jnp.where(pairs.part == collision.TABLE, arm.table_clearance, 0.0)
-
-
-def advance(arm: Arm, edge: Edge, qpos: Array, config: PlanningConfig) -> Edge:
-    """Returns the edge after one more probe or sample; `qpos` (f32[nq]) holds the joints that stay."""
-    rate = jnp.sum(arm.planning_pairs.levers * jnp.abs(edge.change)[None], axis=-1)  # m for the whole edge
-    # A little less than what is proven, since all is computed in float32.
-    room = (edge.boldness * edge.gap + config.resolution) / jnp.maximum(rate, 1e-9)
     is_probing = edge.num_probes < len(PROBES)
     probe = jnp.asarray(PROBES)[jnp.minimum(edge.num_probes, len(PROBES) - 1)]
-    done = jnp.where(is_probing, probe, jnp.minimum(edge.done + jnp.min(room), 1.0))
-    gap = planning_gaps(arm, qpos.at[arm.chain.address].set(edge.start + done * edge.change))
-    is_clear = jnp.all(gap > 0.0)
-    is_proven = is_clear & jnp.all(edge.gap + gap >= rate * (done - edge.done) * (1.0 + 1e-4)) & ~is_probing
-    is_bold = edge.boldness > 1.0
+    step = jnp.minimum(_step(pairs, edge, bounds, resolution), 1.0 - edge.done)
+    place = jnp.where(is_probing, probe, edge.done + step)
+    sample = look(arm, qpos.at[arm.chain.address].set(edge.start + place[None] * edge.change))
+    is_clear = jnp.all(sample.gap > 0.0, axis=0)
+    way, fall = ways(edge.sample.axes, sample.axes)
+    is_proven = ~is_probing & is_clear & is_free_between(pairs, (edge.sample, sample), step, bounds, way)
+    is_new = is_proven | is_probing
+    share = jnp.where(is_probing, PROBES[-2] - PROBES[-1], jnp.maximum(step, 1e-9))
     new = edge._replace(
-        done=jnp.where(is_proven, done, edge.done),
-        gap=jnp.where(is_proven, gap, edge.gap),
-        boldness=jnp.where(is_proven | is_probing, BOLD, 1.0),
+        done=jnp.where(is_proven, place, edge.done),
+        sample=jax.tree.map(lambda a, b: jnp.where(is_new[None], a, b), sample, edge.sample),
+        speed=jnp.where(is_new[None], way / share[None], edge.speed),
+        sink=jnp.where(is_new[None], jnp.where(is_probing[None], way, fall) / share[None], edge.sink),
+        num_tries=jnp.where(is_new, 0, edge.num_tries + 1),
         num_probes=edge.num_probes + is_probing.astype(jnp.int32),
-        is_blocked=jnp.where(is_probing, ~is_clear, ~is_proven & ~is_bold),
+        is_blocked=jnp.where(is_probing, ~is_clear, ~is_proven & (edge.num_tries >= LAST_TRY)),
     )
-    return jax.tree.map(lambda a, b: jnp.where(is_settled(edge), b, a), new, edge)
+    stays = is_settled(edge)
+    return jax.tree.map(lambda a, b: jnp.where(stays[None] if a.ndim > stays.ndim else stays, b, a), new, edge)
+
+
+def _step(pairs: collision.Pairs, edge: Edge, bounds: Bounds, resolution: float) -> Array:
+    """Returns f32[], the share of the edge to the next sample."""
+    wide = functools.partial(widened, batch=edge.done.ndim)
+    gap, boldness = edge.sample.gap, jnp.asarray(BOLD)[jnp.minimum(edge.num_tries, LAST_TRY)][None]
+    by_levers = (boldness * gap + resolution) / jnp.maximum(bounds.rate, 1e-9)
+    is_table, mover = wide(pairs.part == collision.TABLE), pairs.mover
+    # The root of speed t + curve t^2 = reserve.
+    reserve = jnp.where(is_table, 0.5, 1.0) * boldness * gap
+    speed = jnp.where(is_table, edge.sink[mover], edge.speed[mover])
+    curve = jnp.where(is_table, 0.125, 0.25) * bounds.bend[mover]
+    by_chord = 2.0 * reserve / (speed + jnp.sqrt(speed * speed + 4.0 * curve * reserve) + 1e-9)
+    has_chord = wide(pairs.is_still) & (edge.num_tries < LAST_TRY)[None]
+    return jnp.min(jnp.where(has_chord, jnp.maximum(by_levers, by_chord), by_levers), axis=0)
 
 
 def edge_is_free(arm: Arm, start: Array, end: Array, config: PlanningConfig) -> Array:

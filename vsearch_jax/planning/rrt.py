@@ -18,8 +18,8 @@ from vsearch_jax.planning.shortcuts import Crooked
 from vsearch_jax.planning.trees import Problem
 from vsearch_jax.types import Path, PlanStatus
 
-# Lanes of a batch: the vector units are busy with the pairs of one lane, and many lanes idle at the end.
-MOST_LANES = 32
+# Lanes of a batch: more cost less each, but more of them idle at the end.
+MOST_LANES = 64
 
 
 def rrt_connect(arm: Arm, key: Array, start: Array, goal: Array, config: PlanningConfig) -> Path:

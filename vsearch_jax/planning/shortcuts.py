@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -73,8 +72,7 @@ def is_done(config: PlanningConfig, state: Shortcut) -> Array:
 
 def step(arm: Arm, config: PlanningConfig, problem: Crooked, state: Shortcut) -> Shortcut:
     """Looks at some samples of the edge; where it is settled, takes it if it is free, and proposes the next."""
-    forward = functools.partial(advance, arm, qpos=problem.qpos, config=config)
-    edge = jax.lax.fori_loop(0, SAMPLES_PER_STEP, lambda _, edge: forward(edge), state.edge)
+    edge = advance(arm, state.edge, problem.qpos, config, SAMPLES_PER_STEP)
     is_free = is_whole(edge)
     taken = _cut(state._replace(edge=edge))
     path = jax.tree.map(lambda a, b: jnp.where(is_free, a, b), taken, (state.waypoints, state.num_points))

@@ -15,7 +15,7 @@ from jax import Array
 
 from vsearch_jax.arm import Arm
 from vsearch_jax.config import PlanningConfig
-from vsearch_jax.planning.edges import planning_gaps
+from vsearch_jax.planning.proofs import look
 from vsearch_jax.types import Path, Trajectory
 
 # Intervals of the grid on each straight piece and on each bend.
@@ -141,7 +141,7 @@ def _at(arm: Arm, trajectory: Trajectory, piece: Array, place: Array) -> tuple[A
 
 def _bend_radii(arm: Arm, waypoints: Array, unit: Array, lengths: Array) -> Array:
     """Returns f32[W]: how far in rad before and after each waypoint its bend begins and ends; 0 at both ends."""
-    gap = jax.vmap(functools.partial(planning_gaps, arm))(waypoints[1:-1])
+    gap = jax.vmap(functools.partial(look, arm))(waypoints[1:-1]).gap
     rate = jnp.sum(arm.planning_pairs.levers[None] * jnp.abs(unit)[:, None], axis=-1)
     room = gap / jnp.maximum(jnp.maximum(rate[:-1], rate[1:]), 1e-9)
     free = FREE_SHARE * jnp.min(room, axis=-1, initial=jnp.inf)

@@ -5,7 +5,6 @@ Sources: LaValle, Rapidly-exploring random trees (1998); Kuffner and LaValle, RR
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -103,8 +102,7 @@ def begin(arm: Arm, config: PlanningConfig, problem: Problem, trees: Trees, is_n
 
 def step(arm: Arm, config: PlanningConfig, is_bidirectional: bool, problem: Problem, trees: Trees) -> Trees:
     """Looks at some samples of the edge; where it is settled, keeps what it reached and starts the next."""
-    forward = functools.partial(advance, arm, qpos=problem.qpos, config=config)
-    edge = jax.lax.fori_loop(0, SAMPLES_PER_STEP, lambda _, edge: forward(edge), trees.edge)
+    edge = advance(arm, trees.edge, problem.qpos, config, SAMPLES_PER_STEP)
     is_ready = is_settled(edge) & ~trees.is_done
     progress = jnp.linalg.norm(edge.done * edge.change)
     is_kept = is_ready & (is_whole(edge) | (progress > LEAST_PROGRESS * config.step))

@@ -11,8 +11,8 @@ import numpy as np
 from jax import Array
 
 from vsearch_jax.batches import map_batched
+from vsearch_jax.boundary import materialize, unknown_zero
 from vsearch_jax.render import shading, texturing, trace
-from vsearch_jax.render.boundary import materialize, unknown_zero
 from vsearch_jax.render.camera import magnified, pinhole, pixel_rays
 from vsearch_jax.render.lighting import (
     LightPoses,

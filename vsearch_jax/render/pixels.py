@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxlie import SO3
 
+from vsearch_jax.boundary import materialize
 from vsearch_jax.render import texturing, trace
-from vsearch_jax.render.boundary import materialize
 from vsearch_jax.render.rays import Vector, dot
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.render.shading import Surface

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.render.boundary import materialize
+from vsearch_jax.boundary import materialize
 from vsearch_jax.render.rays import Vector
 from vsearch_jax.render.triangles import Triangles
 

@@ -1,12 +1,7 @@
-"""Signed distances between the arm's capsules and what they must not touch.
-
-Two capsules have a closed form. From a capsule to another convex solid the distance is that of the solid, minimised
-over the capsule's axis; it is convex there, so a golden section finds it.
-"""
+"""Which solids can touch, and what planning needs to know of each pair of them."""
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import flax.struct
@@ -16,10 +11,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from vsearch_jax import shapes
 from vsearch_jax.kinematics import Placement, build_placement, rotate
 from vsearch_jax.levers import extent_from_still_point, lever_arms
-from vsearch_jax.shapes import Vector
 
 GEOM = mujoco.mjtGeom
 TABLE, OBJECT, SELF, OBSTACLE = range(4)
@@ -36,19 +29,17 @@ class Solids:
       position: f32[N, 3] m, the solid's middle in world.
       rotation: f32[N, 3, 3], of the solid, to world.
       size: f32[N, 3] m: half sizes of a box, radii of an ellipsoid, radius and half length of a cylinder.
-      is_cylinder: bool[N].
     """
 
     capsule: Array
     position: Array
     rotation: Array
     size: Array
-    is_cylinder: Array
 
 
 @flax.struct.dataclass
 class Pairs:
-    """What must not touch; C capsules, N pairs in the order table, capsules, blocks, ellipsoids.
+    """What must not touch; C capsules, N pairs in the order table, capsules, boxes, cylinders, ellipsoids.
 
     Attributes:
       geom: i32[C], the geom of each capsule.
@@ -60,10 +51,14 @@ class Pairs:
       table: i32[M], capsules that must stay above the table.
       first: i32[P], one of each pair of capsules.
       second: i32[P], the other one.
-      blocks: capsules against boxes and cylinders.
+      boxes: capsules against boxes, and against the boxes around meshes.
+      cylinders: capsules against cylinders.
       ellipsoids: capsules against ellipsoids.
       part: i32[N], what the arm would touch: TABLE, OBJECT, SELF (the mount included) or OBSTACLE.
       levers: f32[N, J], most metres by which a unit of each joint of the chain shortens the distance.
+      mover: i32[N], row of the capsule of the pair that moves, of both the first.
+      is_still: bool[N], whether the other one stands still.
+      reach: f32[C, J], most metres by which a unit of each joint of the chain moves any point of each capsule.
     """
 
     geom: Array
@@ -75,10 +70,14 @@ class Pairs:
     table: Array
     first: Array
     second: Array
-    blocks: Solids
+    boxes: Solids
+    cylinders: Solids
     ellipsoids: Solids
     part: Array
     levers: Array
+    mover: Array
+    is_still: Array
+    reach: Array
 
 
 class Geoms(NamedTuple):
@@ -112,13 +111,13 @@ def build_pairs(
     hulls = [_enclosing_capsule(model, g) for g in capsules]
     round_pairs = [(a, b) for a, b in pairs if b in row]
     solid_pairs = [(a, b) for a, b in pairs if b not in row]
-    is_smooth = [int(model.geom_type[b]) == int(GEOM.mjGEOM_ELLIPSOID) for _, b in solid_pairs]
-    blocks = [pair for pair, smooth in zip(solid_pairs, is_smooth, strict=True) if not smooth]
-    ellipsoids = [pair for pair, smooth in zip(solid_pairs, is_smooth, strict=True) if smooth]
+    exact = (int(GEOM.mjGEOM_CYLINDER), int(GEOM.mjGEOM_ELLIPSOID))
+    cylinders, ellipsoids = ([pair for pair in solid_pairs if int(model.geom_type[pair[1]]) == kind] for kind in exact)
+    boxes = [pair for pair in solid_pairs if int(model.geom_type[pair[1]]) not in exact]
     table = [g for g in _moving(model, geoms) if _meets_table(model, g)]
     if is_for_planning:
         table = [g for g in table if _lowest(model, data, g) < NEVER_NEAR]
-    in_order = [*((g, None) for g in table), *round_pairs, *blocks, *ellipsoids]
+    in_order = [*((g, None) for g in table), *round_pairs, *boxes, *cylinders, *ellipsoids]
     arms = lever_arms(model, data, joints)
     placement = jax.tree.map(lambda leaf: leaf[np.asarray(capsules)], build_placement(model, data, "geom"))
     center, half_axis = (jnp.asarray([hull[i] for hull in hulls], jnp.float32) for i in range(2))
@@ -132,69 +131,15 @@ def build_pairs(
         table=jnp.asarray([row[g] for g in table], jnp.int32),
         first=jnp.asarray([row[a] for a, _ in round_pairs], jnp.int32),
         second=jnp.asarray([row[b] for _, b in round_pairs], jnp.int32),
-        blocks=_solids(model, data, blocks, row),
+        boxes=_solids(model, data, boxes, row),
+        cylinders=_solids(model, data, cylinders, row),
         ellipsoids=_solids(model, data, ellipsoids, row),
         part=jnp.asarray([_part(geoms, b) for _, b in in_order], jnp.int32),
         levers=jnp.asarray([_relative_levers(arms, a, b) for a, b in in_order], jnp.float32).reshape(-1, len(joints)),
+        mover=jnp.asarray([row[a] for a, _ in in_order], jnp.int32),
+        is_still=jnp.asarray([b is None or not arms[b].any() for _, b in in_order], bool),
+        reach=jnp.asarray(arms[capsules], jnp.float32),
     )
-
-
-def gaps(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> Array:
-    """Returns the signed distance f32[N] in m of each pair, from the poses of the geoms.
-
-    Args:
-      pairs: what must not touch.
-      geom_xpos: f32[ngeom, 3] m in world.
-      geom_xmat: f32[ngeom, 3, 3] to world.
-      table_height: f32[] m, world z.
-    """
-    rotation = geom_xmat[pairs.geom]
-    middle = shapes.turned(rotation, shapes.planes(pairs.center))
-    center = shapes.along(middle, jnp.ones_like(pairs.radius), shapes.planes(geom_xpos[pairs.geom]))
-    return _gaps(pairs, center, shapes.turned(rotation, shapes.planes(pairs.half_axis)), table_height)
-
-
-def gaps_from_frames(pairs: Pairs, rotations: Array, positions: Array, table_height: Array) -> Array:
-    """Returns what `gaps` does, from the frames of the joints (see `kinematics.frames`): less work, nothing else."""
-    rotation = rotations[pairs.placement.frame]
-    center = positions[pairs.placement.frame] + rotate(rotation, pairs.placement.position)
-    half_axis = rotate(rotation, pairs.frame_half_axis)
-    return _gaps(pairs, shapes.planes(center), shapes.planes(half_axis), table_height)
-
-
-def _gaps(pairs: Pairs, center: Vector, half_axis: Vector, table_height: Array) -> Array:
-    lowest = center[2] - jnp.abs(half_axis[2]) - pairs.radius
-    first, second = pairs.first, pairs.second
-    apart = shapes.segment_distance(*(_rows(v, i) for i in (first, second) for v in (center, half_axis)))
-
-    def solid(solids: Solids) -> tuple[Vector, Vector]:
-        offset = shapes.minus(_rows(center, solids.capsule), shapes.planes(solids.position))
-        turned_back = functools.partial(shapes.turned_back, solids.rotation)
-        return turned_back(offset), turned_back(_rows(half_axis, solids.capsule))
-
-    blocks, ellipsoids = pairs.blocks, pairs.ellipsoids
-    block_size, radii = shapes.planes(blocks.size), shapes.planes(ellipsoids.size)
-    from_blocks = shapes.least_along(
-        lambda point: shapes.block_distance(point, block_size, blocks.is_cylinder), *solid(blocks)
-    )
-    from_ellipsoids = shapes.least_along(lambda point: shapes.ellipsoid_distance(point, radii), *solid(ellipsoids))
-    return jnp.concatenate(
-        [
-            lowest[pairs.table] - table_height,
-            apart - pairs.radius[first] - pairs.radius[second],
-            from_blocks - pairs.radius[blocks.capsule],
-            from_ellipsoids - pairs.radius[ellipsoids.capsule],
-        ]
-    )
-
-
-def least(pairs: Pairs, gap: Array, part: int) -> Array:
-    """Returns the least of the distances `gap` (f32[N]) from one part, f32[] m; +inf where there is nothing."""
-    return jnp.min(jnp.where(pairs.part == part, gap, jnp.inf), initial=jnp.inf)
-
-
-def _rows(vector: Vector, index: Array) -> Vector:
-    return vector[0][index], vector[1][index], vector[2][index]
 
 
 def _moving(model: mujoco.MjModel, geoms: Geoms) -> list[int]:
@@ -272,7 +217,6 @@ def _solids(model: mujoco.MjModel, data: mujoco.MjData, pairs: list[tuple[int, i
         position=jnp.asarray(data.geom_xpos[geoms] + np.einsum("nij,nj->ni", rotation, center), jnp.float32),
         rotation=jnp.asarray(rotation, jnp.float32),
         size=jnp.asarray(np.where(is_exact, model.geom_size[geoms], box[:, 3:]), jnp.float32),
-        is_cylinder=jnp.asarray(kinds == int(GEOM.mjGEOM_CYLINDER)),
     )
 
 
