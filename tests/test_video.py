@@ -30,9 +30,10 @@ HEIGHT = 90
 @pytest.fixture(scope="module")
 def config() -> vs.Config:
     smoke = vs.Config.preset("smoke")
-    return dataclasses.replace(
-        smoke, env=dataclasses.replace(smoke.env, episode_length=NUM_STEPS, action_scale_deg=5.0)
-    )
+    # Silhouettes need no light, which is half of what a picture takes to compile.
+    encoder = dataclasses.replace(smoke.encoder, input="silhouette")
+    env = dataclasses.replace(smoke.env, episode_length=NUM_STEPS, action_scale_deg=5.0)
+    return dataclasses.replace(smoke, encoder=encoder, env=env)
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +41,8 @@ def state(config: vs.Config) -> TrainState:
     """What a film reads of a state, its networks made up: to initialise them takes longer to compile."""
     random = np.random.default_rng(0)
 
-    def made(function, *arguments):
-        shapes = jax.eval_shape(function, jax.random.key(0), *arguments)
+    def made(function):
+        shapes = jax.eval_shape(function, jax.random.key(0))
         return jax.tree.map(lambda x: jnp.asarray(0.2 * random.normal(size=x.shape), x.dtype), shapes)
 
     sac_state = made(lambda key: sac.init(key, config.sac, 2 * config.encoder.code_size + 9))
@@ -179,13 +180,12 @@ def test_what_cannot_be_finished_leaves_nothing(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("limit", [0, 60_000])
-def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path, limit: int) -> None:
+def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path) -> None:
     code = f"""
 import resource, numpy as np
 from vsearch_jax import report
 noise = np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3), dtype=np.uint8)
-resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
+resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 try:
     report.write_film(__import__("pathlib").Path({str(tmp_path / "film.mp4")!r}), noise, 25, (64, 64))
 except report.FilmError as error:
