@@ -13,7 +13,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 import standin
-from vsearch_jax import checkpoint, cli, runner
+from vsearch_jax import checkpoint, cli, runner, video
 from vsearch_jax.config import Config
 from vsearch_jax.metrics_log import STAGES, MetricsLog, read_metrics
 from vsearch_jax.run_folder import RunError, held, read_config, read_seed
@@ -92,7 +92,7 @@ def test_paths_are_made_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("", "train, eval, export"),
+        ("", "train, eval, export, reach, video"),
         ("bogus", "bogus"),
         ("train", "--out"),
         ("train --out {out} --preset huge", "unknown preset 'huge'; allowed: smoke, cpu, thesis, gpu"),
@@ -103,6 +103,7 @@ def test_paths_are_made_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         ("train --out {out} --resume", "no run in"),
         ("eval {out}", "no run in .*config.json is missing"),
         ("export {out} --out {out}2", "no run in"),
+        ("video {out} --out {out}.mp4", "no run in"),
         ("reach --out {out} --radius -1", "SceneConfig.radius is -1"),
         ("reach --out {out} --mesh-scale 0", "SceneConfig.mesh_scale is 0"),
     ],
@@ -211,11 +212,37 @@ def test_a_damaged_seed_is_found_before_anything_runs(
     assert contents(tmp_path) == before
 
 
-def test_an_unfinished_run_is_not_evaluated(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["eval {run}", "video {run} --out {run}.mp4"])
+def test_an_unfinished_run_is_not_evaluated(
+    quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str
+) -> None:
     config = Config.preset("smoke")
     runner.start(tmp_path / "run", config, seed=0)
-    message = fails(capsys, "eval", str(tmp_path / "run"))
+    message = fails(capsys, *command.format(run=tmp_path / "run").split())
     assert f"0 of {config.num_iterations} iterations" in message and "--resume" in message
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_film_is_made_in_a_new_file_only(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run = str(tmp_path / "run")
+    cli.main(["train", "--preset", "smoke", "--out", run])
+    (tmp_path / "old.mp4").write_text("mine")
+    before = contents(tmp_path)
+    for out, message in {"old.mp4": "old.mp4 exists; name another file", "a.gif": "a.gif does not end in .mp4"}.items():
+        assert message in fails(capsys, "video", run, "--out", str(tmp_path / out))
+    assert contents(tmp_path) == before
+
+
+def test_a_film_is_of_the_run_and_as_asked(quick: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    run, asked = tmp_path / "run", []
+    cli.main(["train", "--preset", "smoke", "--out", str(run)])
+    monkeypatch.setattr(video, "make_video", lambda *arguments: asked.append(arguments) or "made")
+    out = tmp_path / "films" / "a.mp4"
+    cli.main(["video", str(run), "--out", str(out)])
+    cli.main(["video", str(run), "--out", str(out), "--motion", "kinematic", "--seed", "3"])
+    assert [arguments[3:] for arguments in asked] == [("dynamic", None), ("kinematic", 3)]
+    assert all(arguments[0] == out and arguments[2] == read_config(run) for arguments in asked)
+    assert out.parent.is_dir() and not out.exists()
 
 
 def test_damaged_config_is_one_line(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -10,16 +10,16 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Union
 
 import tyro
 from rich.console import Console
 
-from vsearch_jax.commands import DEFAULT_PRESET, Command, Eval, Export, Reach, Train
+from vsearch_jax.commands import DEFAULT_PRESET, Command, Eval, Export, Reach, Train, Video
 from vsearch_jax.config import Config, SceneConfig
-from vsearch_jax.run_folder import RunError, claim, held, read_config, read_seed
+from vsearch_jax.run_folder import RunError, claim, claim_file, held, read_config, read_seed
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it: 128 + SIGINT."""
@@ -46,6 +46,7 @@ def parse(arguments: Sequence[str]) -> Command:
         Annotated[Eval, tyro.conf.subcommand("eval")],
         Annotated[Export, tyro.conf.subcommand("export")],
         Annotated[Reach, tyro.conf.subcommand("reach")],
+        Annotated[Video, tyro.conf.subcommand("video")],
     ]
     errors = io.StringIO()
     try:
@@ -53,7 +54,7 @@ def parse(arguments: Sequence[str]) -> Command:
             command = tyro.cli(
                 command_type,
                 prog="vsearch",
-                description="View search in JAX: train, evaluate, export, reach.",
+                description="View search in JAX: train, evaluate, export, reach, video.",
                 args=arguments,
             )
     except SystemExit as exit_:
@@ -186,11 +187,34 @@ def run_reach(command: Reach) -> None:
     print(message)
 
 
+def run_video(command: Video) -> None:
+    """Runs `vsearch video`."""
+    runner = _import_runner()
+    from vsearch_jax.video import make_video
+
+    config = read_config(command.run)
+    state = runner.resume(command.run, config)
+    runner.check_finished(command.run, state, config)
+    claim_file(command.out, ".mp4")
+    with Console().status("filming a search"):
+        message = make_video(command.out, state, config, command.motion, command.seed)
+    print(message)
+
+
 def _import_runner() -> Any:
     # mjx prints on import that Warp is missing, which nothing here needs.
     with contextlib.redirect_stdout(io.StringIO()):
         from vsearch_jax import runner
     return runner
+
+
+_RUN: dict[type, Callable[[Any], None]] = {
+    Train: run_train,
+    Eval: run_eval,
+    Export: run_export,
+    Reach: run_reach,
+    Video: run_video,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -200,8 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command = None
     try:
         command = parse(sys.argv[1:] if arguments is None else arguments)
-        run = {Train: run_train, Eval: run_eval, Export: run_export, Reach: run_reach}[type(command)]
-        run(command)
+        _RUN[type(command)](command)
     except KeyboardInterrupt:
         print(f"\nvsearch: {_interrupted(command)}", file=sys.stderr)
         sys.stdout.flush()

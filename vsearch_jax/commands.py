@@ -88,4 +88,18 @@ class Reach:
     """Metres in the unit of the object's mesh file."""
 
 
-Command = Train | Eval | Export | Reach
+@dataclasses.dataclass(frozen=True)
+class Video:
+    """Films one search by the first policy of a finished run: the arm, what its camera sees, the target, the cosine."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder that `vsearch train` made."""
+    out: Path
+    """The film, an .mp4 file; it must not exist."""
+    motion: Literal["dynamic", "kinematic"] = "dynamic"
+    """The arm as its dynamics move it, or exactly on the planned paths."""
+    seed: Annotated[int | None, _option("INT", "the search that the run's report shows")] = None
+    """Of a random initial view and target."""
+
+
+Command = Train | Eval | Export | Reach | Video

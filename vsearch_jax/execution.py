@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -69,23 +70,59 @@ def execute(arm: Arm, model: mjx.Model, trajectory: Trajectory, config: Planning
     return _run(arm, model, trajectory, jnp.float32(config.settling_time))
 
 
-@jax.custom_batching.sequential_vmap
-def _run(arm: Arm, model: mjx.Model, trajectory: Trajectory, settling_time: Array) -> Execution:
+def pass_through(
+    arm: Arm, model: mjx.Model, trajectory: Trajectory, config: PlanningConfig, times: Array
+) -> tuple[Array, Array]:
+    """Returns where the arm is at each of `times` while it does what `execute` does.
+
+    Args:
+      arm: see `execute`.
+      model: see `execute`.
+      trajectory: see `execute`.
+      config: see `execute`.
+      times: f32[F] s since the start, rising; from the end of the motion on, the arm is where `execute` leaves it.
+
+    Returns:
+      Joints f32[F, nq] rad or m, and f32[] s, when the arm has come to stand.
+    """
+    total = duration(trajectory) + config.settling_time
+
+    def go_on(data: mjx.Data, time: Array) -> tuple[mjx.Data, Array]:
+        end = jnp.minimum(time, total)
+        data = jax.lax.while_loop(
+            lambda data: data.time < end, functools.partial(_follow, arm, model, trajectory), data
+        )
+        return data, data.qpos
+
+    return jax.lax.scan(go_on, _at_start(arm, trajectory), times)[1], total
+
+
+def _at_start(arm: Arm, trajectory: Trajectory) -> mjx.Data:
+    return arm.data.replace(qpos=trajectory.waypoints[0])
+
+
+def _follow(arm: Arm, model: mjx.Model, trajectory: Trajectory, data: mjx.Data) -> mjx.Data:
+    """Returns the data one step of the dynamics later."""
     gain, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
     lead = damping / jnp.maximum(gain, 1e-9)
     in_qpos = jnp.asarray(model.jnt_qposadr)[jnp.asarray(model.actuator_trnid[:, 0])]
+    joints, velocity = sample(arm, trajectory, data.time)
+    command = joints[in_qpos] + lead * velocity[in_qpos]
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # mjx promotes freely
+        return mjx.step(model, data.replace(ctrl=command))
+
+
+@jax.custom_batching.sequential_vmap
+def _run(arm: Arm, model: mjx.Model, trajectory: Trajectory, settling_time: Array) -> Execution:
     total = duration(trajectory) + settling_time
 
     def step(state: tuple[mjx.Data, Array, Array]) -> tuple[mjx.Data, Array, Array]:
         data, peak, energy = state
-        joints, velocity = sample(arm, trajectory, data.time)
-        command = joints[in_qpos] + lead * velocity[in_qpos]
-        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # mjx promotes freely
-            data = mjx.step(model, data.replace(ctrl=command))
+        data = _follow(arm, model, trajectory, data)
         torque = data.qfrc_actuator
         work = jnp.sum(jnp.maximum(torque * data.qvel, 0.0)) * model.opt.timestep
         return data, jnp.maximum(peak, jnp.abs(torque)), energy + work
 
-    start = (arm.data.replace(qpos=trajectory.waypoints[0]), jnp.zeros(model.nv), jnp.zeros(()))
+    start = (_at_start(arm, trajectory), jnp.zeros(model.nv), jnp.zeros(()))
     data, peak, energy = jax.lax.while_loop(lambda state: state[0].time < total, step, start)
     return Execution(data.qpos, peak, energy, data.time)

@@ -45,6 +45,19 @@ def claim(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
 
 
+def claim_file(path: Path, suffix: str) -> None:
+    """Checks that nothing is at `path`, where a new file is to be made, and makes its folder.
+
+    Raises:
+      RunError: something is there, or the name does not end in `suffix`.
+    """
+    if path.suffix.lower() != suffix:
+        raise RunError(f"{path} does not end in {suffix}; name a file that does with --out")
+    if path.exists():
+        raise RunError(f"{path} exists; name another file with --out")
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
 @contextlib.contextmanager
 def claimed(run: Path) -> Iterator[None]:
     """Makes the folder `run` for a new run, and takes away what the block that is to start the run wrote if it fails.
@@ -140,11 +153,17 @@ def _read(run: Path) -> dict[str, Any]:
 
 def write(path: Path, content: str | bytes) -> None:
     """Replaces the file `path` in one step: whoever reads it sees the old content or the new one."""
-    temporary = path.with_name(f".{path.name}.tmp")
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields an empty file beside `path`, of the same suffix, that takes its name when the block ends well."""
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
         with temporary.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
+            yield temporary
             os.fsync(file.fileno())  # else a crash of the machine may leave the new name with no content
         temporary.replace(path)
     finally:

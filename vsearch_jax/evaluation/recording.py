@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -27,25 +28,62 @@ def record_search(state: TrainState, config: Config) -> dict[str, Array]:
       `num_steps` i32[], after which the rest repeats.
     """
     env = ViewSearchEnv(config, state.encoder, state.reach)
-    actor = jax.tree.map(lambda x: x[0], state.sac.actor)
-    initial_key, target_key = jax.random.split(jax.random.fold_in(state.key, 2**31 - 2))
-    target_view = protocol_target(config)
-    far_side = View(wrap_angle(target_view.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))
-    keys, is_fixed = (initial_key, target_key), jnp.bool_(True)
-    asked = (Asked(view, env.random_joints(k), is_fixed) for k, view in zip(keys, (far_side, target_view), strict=True))
-    initial, target = (look_at(env, one) for one in asked)
-    start = env.start(initial, target)
+    actor = first_actor(state)
+    start = begin(env, far_side(env, state.key))
 
-    def step(state: Any, _: None) -> tuple[Any, Any]:
-        moved = env.step(state, sac.act(None, actor, state.obs, config.sac))
-        moved = jax.tree.map(lambda new, old: jnp.where(state.done > 0, old, new), moved, state)
-        return moved, moved
+    def step(now: Any) -> tuple[Any, None]:
+        return env.step(now, sac.act(None, actor, now.obs, config.sac)), None
 
-    _, states = jax.lax.scan(step, start, length=config.env.episode_length)
-    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
+    states, _ = follow(step, start, config.env.episode_length)
     return {
         "images": jax.lax.map(lambda qpos: env.picture(qpos)[1].rgb, states.pipeline_state.sight.qpos),
         "similarity": states.metrics["similarity"],
-        "target": env.picture(target.qpos)[1].rgb,
+        "target": env.picture(start.pipeline_state.target.qpos)[1].rgb,
         "num_steps": states.pipeline_state.num_steps[-1],
     }
+
+
+def first_actor(state: TrainState) -> Any:
+    """Returns the parameters of the first of the run's policies."""
+    return jax.tree.map(lambda x: x[0], state.sac.actor)
+
+
+def far_side(env: ViewSearchEnv, key: Array) -> Asked:
+    """Returns, leading axis 2, an initial view beyond the object and the protocol's target.
+
+    Args:
+      env: the task.
+      key: that of the TrainState.
+    """
+    target = protocol_target(env.config)
+    initial = View(wrap_angle(target.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))
+    views = jax.tree.map(lambda *x: jnp.stack(x), initial, target)
+    keys = jax.random.split(jax.random.fold_in(key, 2**31 - 2))
+    return Asked(views, jax.vmap(env.random_joints)(keys), jnp.ones(2, bool))
+
+
+def begin(env: ViewSearchEnv, ends: Asked) -> Any:
+    """Returns the brax State at the start of the episode between `ends`, initial view and target on a leading axis."""
+    sights = jax.lax.map(functools.partial(look_at, env), ends)
+    return env.start(*(jax.tree.map(lambda x, i=i: x[i], sights) for i in range(2)))
+
+
+def follow(step: Callable[[Any], tuple[Any, Any]], start: Any, length: int) -> tuple[Any, Any]:
+    """Follows an episode to its end.
+
+    Args:
+      step: brax State -> the next one, and whatever is to be kept of the step.
+      start: brax State.
+      length: T, the most steps.
+
+    Returns:
+      States, leading axis T + 1, the start first, and what was kept, leading axis T. After the end the state repeats.
+    """
+
+    def go_on(state: Any, _: None) -> tuple[Any, Any]:
+        moved, kept = step(state)
+        moved = jax.tree.map(lambda new, old: jnp.where(state.done > 0, old, new), moved, state)
+        return moved, (moved, kept)
+
+    _, (states, kept) = jax.lax.scan(go_on, start, length=length)
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states), kept

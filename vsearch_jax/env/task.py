@@ -7,17 +7,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from brax.envs.base import Env, State
 from jax import Array
-from jax.core import Tracer
 
 from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
-from vsearch_jax.config import Config, ConfigError
+from vsearch_jax.config import Config
+from vsearch_jax.env.episode import check_band, episode_of, observe
 from vsearch_jax.execution import check_actuators, execute
-from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
+from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.planning import (
     Motion,
     duration,
@@ -30,7 +29,18 @@ from vsearch_jax.planning import (
     time_path,
 )
 from vsearch_jax.scene import SceneError, build_scene
-from vsearch_jax.types import Camera, EncoderState, EpisodeState, Image, PlanStatus, ReachabilityMap, Sight, View
+from vsearch_jax.types import (
+    Camera,
+    EncoderState,
+    EpisodeState,
+    Image,
+    Path,
+    PlanStatus,
+    ReachabilityMap,
+    Sight,
+    Trajectory,
+    View,
+)
 
 _REACH_SEED = 20_191_201
 """Of the starts from which the reachability map is solved: the same map in every run, whatever the run's seed."""
@@ -124,14 +134,20 @@ class ViewSearchEnv(Env):
 
     def step(self, state: State, action: Array) -> State:
         """Returns the state after moving by `action` (f32[2], clipped to [-1, 1])."""
-        episode = episode_of(state)
-        task = self.config.env
-        delta = jnp.clip(action, -1.0, 1.0) * math.radians(task.action_scale_deg)
-        old = episode.sight
-        view = View(wrap_angle(old.view.azimuth + delta[0]), old.view.elevation + delta[1])
-        moved, motion = self.go(view, old.qpos)
+        moved, motion = self.go(self.commanded(state, action), episode_of(state).sight.qpos)
+        return self.arrive(state, moved, motion)
+
+    def commanded(self, state: State, action: Array) -> View:
+        """Returns the view to which `action` (f32[2], clipped to [-1, 1]) leads, whether or not the arm reaches it."""
+        old = episode_of(state).sight.view
+        delta = jnp.clip(action, -1.0, 1.0) * math.radians(self.config.env.action_scale_deg)
+        return View(wrap_angle(old.azimuth + delta[0]), old.elevation + delta[1])
+
+    def arrive(self, state: State, moved: Sight, motion: Motion) -> State:
+        """Returns the state after a step that led to `moved`, or nowhere where its motion was not found."""
+        episode, task = episode_of(state), self.config.env
         is_reachable = motion.is_found
-        sight = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), moved, old)
+        sight = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), moved, episode.sight)
         similarity = cosine_similarity(sight.code, episode.target.code)
         is_found = is_reachable & (similarity >= task.threshold)
         reward = jnp.where(is_found, task.success_reward, similarity - 1.0)
@@ -223,17 +239,29 @@ class ViewSearchEnv(Env):
 
         Without a path it stays. In dynamic motion it follows the path and ends where its dynamics lead.
         """
-        path = rrt_connect(self.arm, jax.random.key(_PLANNING_SEED), qpos, goal, self.config.planning)
-        is_found = path.status == int(PlanStatus.FOUND)
-        if self.arm.without_speed and self.config.env.motion == "kinematic":
-            return path.waypoints[-1], Motion(is_found, path.length, jnp.float32(jnp.nan))
-        trajectory = time_path(self.arm, path, self.config.planning)
-        motion = Motion(is_found, path.length, duration(trajectory))
-        if self.config.env.motion == "kinematic":
-            return path.waypoints[-1], motion
+        is_kinematic = self.config.env.motion == "kinematic"
+        if self.arm.without_speed and is_kinematic:
+            path = self._path(qpos, goal)
+            return path.waypoints[-1], Motion(_is_found(path), path.length, jnp.float32(jnp.nan))
+        trajectory, motion = self.plan(qpos, goal)
+        if is_kinematic:
+            return trajectory.waypoints[-1], motion
         reached = execute(self.arm, self.scene.mjx_model, trajectory, self.config.planning).qpos
         # The limits are soft constraints: the next plan must be able to start from here.
         return jnp.clip(reached, self.arm.lower, self.arm.upper), motion
+
+    def plan(self, qpos: Array, goal: Array) -> tuple[Trajectory, Motion]:
+        """Returns the motion from `qpos` to `goal` (f32[nq] each) and what it costs; the same one every time.
+
+        Raises:
+          PlanningError: the model gives no speed limit for a joint.
+        """
+        path = self._path(qpos, goal)
+        trajectory = time_path(self.arm, path, self.config.planning)
+        return trajectory, Motion(_is_found(path), path.length, duration(trajectory))
+
+    def _path(self, qpos: Array, goal: Array) -> Path:
+        return rrt_connect(self.arm, jax.random.key(_PLANNING_SEED), qpos, goal, self.config.planning)
 
     def see(self, view: View, qpos: Array) -> Sight:
         """Returns what the wrist camera sees with the arm at joints `qpos` (f32[nq]); `view` is only noted."""
@@ -243,8 +271,12 @@ class ViewSearchEnv(Env):
     def raw_look(self, qpos: Array) -> tuple[Camera, Array]:
         """Returns the wrist camera and the raw latent f32[Z] of its picture with the arm at joints `qpos` (f32[nq])."""
         camera, image = self.picture(qpos)
+        return camera, self.raw_latent(image)
+
+    def raw_latent(self, image: Image) -> Array:
+        """Returns the raw latent f32[Z] of a picture of the wrist camera."""
         pixels = encoders.network_input(image, jnp.asarray(self.scene.object_geom_ids), self.config)
-        return camera, encoders.raw_latent(self.encoder.params, pixels, self.config)
+        return encoders.raw_latent(self.encoder.params, pixels, self.config)
 
     def picture(self, qpos: Array) -> tuple[Camera, Image]:
         """Returns the wrist camera and its picture with the arm at joints `qpos` (f32[nq])."""
@@ -258,32 +290,5 @@ class ViewSearchEnv(Env):
         return data, render.camera_from_pose(camera_pose(self.arm, data), self.fovy)
 
 
-def check_band(reach: ReachabilityMap, config: Config) -> None:
-    """Checks that there is a band to search; does nothing under a trace.
-
-    Raises:
-      ConfigError: the arm reaches no elevation at every azimuth.
-    """
-    if not isinstance(reach.band, Tracer) and np.isnan(reach.band).any():
-        raise ConfigError(
-            f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
-            f"at every azimuth around object {config.scene.object!r}; `vsearch reach` draws what it does reach, and "
-            "proposes a mount_height"
-        )
-
-
-def episode_of(state: State) -> EpisodeState:
-    """Returns the episode that a brax State carries."""
-    return state.pipeline_state  # pyright: ignore[reportReturnType] # brax lets any pytree stand here
-
-
-def observe(episode: EpisodeState) -> Array:
-    """Returns the observation: code, target code, joints."""
-    return jnp.concatenate([episode.sight.code, episode.target.code, episode.sight.qpos])
-
-
-def pose_error(camera: Camera, target: Camera) -> tuple[Array, Array, Array]:
-    """Returns rotation error in rad, formula 3.2 of the thesis in rad, and translation error in m."""
-    translation = jnp.sqrt(jnp.sum((camera.position - target.position) ** 2, axis=-1))
-    rotations = (camera.rotation, target.rotation)
-    return rotation_error(*rotations), frobenius_angle(*rotations), translation
+def _is_found(path: Path) -> Array:
+    return path.status == int(PlanStatus.FOUND)
