@@ -179,6 +179,17 @@ def test_resume_with_what_the_run_cannot_do_names_it_and_changes_nothing(
     assert contents(tmp_path) == before
 
 
+def test_a_target_out_of_reach_comes_with_the_map(
+    quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    options = ["--preset", "smoke", "--evaluation.target-elevation-deg", "89"]
+    message = fails(capsys, "train", *options, "--out", str(out))
+    picture = tmp_path / "run-reachability.png"
+    assert "target_elevation_deg is 89" in message and f"{picture} shows" in message
+    assert picture.read_bytes().startswith(b"\x89PNG") and not any(out.iterdir())
+
+
 @pytest.mark.parametrize("seed", [-1, 2**32])
 def test_a_seed_out_of_range_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path, seed: int) -> None:
     out = tmp_path / "run"
@@ -300,6 +311,22 @@ def test_killed_and_resumed_equals_uninterrupted(quick: None, tmp_path: Path) ->
     for name in whole:
         np.testing.assert_array_equal(whole[name], killed[name], err_msg=name)
     assert (out / "results.json").exists()
+
+
+def test_another_motion_is_evaluated_into_a_folder_of_its_own(
+    quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    run, out = tmp_path / "run", tmp_path / "dynamic"
+    cli.main(["train", "--preset", "smoke", "--out", str(run)])
+    before = contents(run)
+    assert "name a folder for the results" in fails(capsys, "eval", str(run), "--motion", "dynamic")
+    cli.main(["eval", str(run), "--motion", "dynamic", "--out", str(out)])
+    assert contents(run) == before
+    results = json.loads((out / "results.json").read_text())
+    assert (results["motion"], results["reachable"]) == ("dynamic", "path")
+    assert "dynamic motion" in (out / "report.html").read_text()
+    assert "exists; name another folder" in fails(capsys, "eval", str(run), "--motion", "dynamic", "--out", str(out))
+    assert "EnvConfig.motion" in fails(capsys, "eval", str(run), "--motion", "dynamic", "--reachable", "ik")
 
 
 @pytest.mark.slow

@@ -138,21 +138,36 @@ def _resume(command: Train) -> Any:
 def run_eval(command: Eval) -> None:
     """Runs `vsearch eval`."""
     runner = _import_runner()
-    console, config = Console(), read_config(command.run)
+    console, trained = Console(), read_config(command.run)
+    config = _with_motion(command, trained)
+    if command.out is None and config != trained:
+        raise RunError(
+            f"{command.run} was trained with env.reachable {trained.env.reachable} and env.motion "
+            f"{trained.env.motion}; name a folder for the results of another evaluation with --out"
+        )
+    if command.out is not None:
+        claim(command.out)
     with held(command.run):
         with console.status("reading the run"):
-            state = runner.resume(command.run, config)
-        _evaluate(command.run, state, config, console)
+            state = runner.resume(command.run, trained)
+        _evaluate(command.run, state, config, console, command.out)
 
 
-def _evaluate(run: Path, state: Any, config: Config, console: Console) -> None:
+def _with_motion(command: Eval, config: Config) -> Config:
+    motion = command.motion or config.env.motion
+    reachable = command.reachable or ("path" if motion == "dynamic" else config.env.reachable)
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, motion=motion, reachable=reachable))
+
+
+def _evaluate(run: Path, state: Any, config: Config, console: Console, out: Path | None = None) -> None:
     runner = _import_runner()
     from vsearch_jax import report
 
+    out = run if out is None else out
     with console.status("evaluating every searcher"):
-        results = runner.finish_evaluation(run, state, config)
+        results = runner.finish_evaluation(run, state, config, out)
     report.print_table(results, console)
-    console.print(f"report: {run / 'report.html'}", highlight=False, soft_wrap=True)
+    console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True)
 
 
 def run_export(command: Export) -> None:

@@ -50,6 +50,12 @@ class Eval:
 
     run: tyro.conf.Positional[Path]
     """Folder that `vsearch train` made."""
+    motion: Annotated[Literal["kinematic", "dynamic"] | None, _option("{kinematic,dynamic}", "the run's")] = None
+    """Joints are set, or driven by the arm's dynamics along paths that are planned."""
+    reachable: Annotated[Literal["ik", "path"] | None, _option("{ik,path}", "the run's; path if dynamic")] = None
+    """A view is reachable where joints for it are free, or where a path to them is found too."""
+    out: Annotated[Path | None, _option("PATH", "the run's own")] = None
+    """Folder of the results; it must not exist, or hold nothing."""
 
 
 @dataclasses.dataclass(frozen=True)

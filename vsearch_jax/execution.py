@@ -58,8 +58,9 @@ def execute(arm: Arm, model: mjx.Model, trajectory: Trajectory, config: Planning
     """Returns what comes of following `trajectory` and then `config.settling_time` of rest.
 
     The commands lead the path by what the actuators' damping makes them lag, so that a steady speed is followed without
-    error. Contacts are not simulated: planning has excluded them. Under `vmap` the motions run one after another, since
-    MJX's chain of bodies is slow when batched on CPU (see `kinematics`).
+    error. Contacts are not simulated: planning has excluded them. An arm whose motion lasts no time stays where it is.
+    Under `vmap` the motions run one after another, since MJX's chain of bodies is slow when batched on CPU (see
+    `kinematics`).
 
     Args:
       arm: the arm.
@@ -114,7 +115,8 @@ def _follow(arm: Arm, model: mjx.Model, trajectory: Trajectory, data: mjx.Data) 
 
 @jax.custom_batching.sequential_vmap
 def _run(arm: Arm, model: mjx.Model, trajectory: Trajectory, settling_time: Array) -> Execution:
-    total = duration(trajectory) + settling_time
+    seconds = duration(trajectory)
+    total = jnp.where(seconds > 0.0, seconds + settling_time, 0.0)
 
     def step(state: tuple[mjx.Data, Array, Array]) -> tuple[mjx.Data, Array, Array]:
         data, peak, energy = state

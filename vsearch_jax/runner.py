@@ -45,10 +45,20 @@ def start(run: Path, config: Config, seed: int) -> TrainState:
         raise ConfigError(f"seed is {seed}; allowed: 0 to {run_folder.MOST_SEED}")
     with run_folder.claimed(run):
         state = in_thread(init, jax.random.key(seed), config)
-        check_target(state.reach, config)  # now, not when the training is done
+        _check_reach(run, state, config)  # now, not when the training is done
         run_folder.write_config(run, config, seed)
         checkpoint.save(run, state, config)
     return state
+
+
+def _check_reach(run: Path, state: TrainState, config: Config) -> None:
+    """Does what `check_target` does, and leaves a picture of what the arm reaches beside the folder `run`."""
+    try:
+        check_target(state.reach, config)
+    except ConfigError as error:
+        picture = run.with_name(f"{run.name}-reachability.png")
+        report.reachability(state.reach).savefig(picture)
+        raise ConfigError(f"{error}; {picture} shows what it reaches") from None
 
 
 def resume(run: Path, config: Config) -> TrainState:
@@ -161,8 +171,14 @@ def check_finite(run: Path, columns: Mapping[str, np.ndarray], step: int, config
             )
 
 
-def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str, Any]:
-    """Evaluates a trained state and writes results.json, figures and report.html into the folder `run`.
+def finish_evaluation(run: Path, state: TrainState, config: Config, out: Path) -> dict[str, Any]:
+    """Evaluates a trained state and writes results.json, figures and report.html.
+
+    Args:
+      run: the run's folder.
+      state: of the run.
+      config: the run's, but for what `evaluate` lets differ.
+      out: folder of the results, the run's or another one.
 
     Returns:
       What `results.json` holds.
@@ -185,7 +201,7 @@ def finish_evaluation(run: Path, state: TrainState, config: Config) -> dict[str,
     results["seed"] = seed
     search = jax.tree.map(np.asarray, in_thread(record_search, state, config))
     pictures = report.draw(results, arrays, search, state.reach, lines, config)
-    report.write(run, results, pictures, config)
+    report.write(out, results, pictures, config)
     return results
 
 

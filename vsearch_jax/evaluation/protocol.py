@@ -28,7 +28,8 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Any]:
 
     Args:
       state: a trained state.
-      config: the config it was trained with; `config.evaluation` may differ.
+      config: the config it was trained with; `config.evaluation` may differ, and in `config.env` what counts as
+        reachable and how the arm moves.
 
     Returns:
       For `random_search` and `cma_es` arrays of [trials] (`num_runs` runs of each initial view, runs fastest), for

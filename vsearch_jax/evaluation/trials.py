@@ -14,7 +14,7 @@ from vsearch_jax.env import ViewSearchEnv
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
-from vsearch_jax.search.common import is_running, taken, to_result
+from vsearch_jax.search.common import Record, is_running, taken, to_result
 from vsearch_jax.types import Camera, SearchResult, Sight, View
 
 
@@ -52,7 +52,8 @@ def search_trials(
       For each searcher its results, what its motions cost (`joint_travel` f32 rad, `motion_time` f32 s, `num_plans`
       i32) and the cameras at the views found, leading axis N.
     """
-    num_views = max(method.num_views for method in methods)
+    # With paths the views of a generation are looked at one after the other.
+    num_views = 1 if env.config.env.reachable == "path" else max(method.num_views for method in methods)
     batch_size = max(1, env.config.evaluation.batch_size // num_views)
 
     def searcher(xs: tuple[Array, Array]) -> _Trial:
@@ -117,9 +118,9 @@ def _generation(
 
     numbers = range(len(methods))
     views, states = jax.lax.switch(number, [functools.partial(ask, i) for i in numbers], trial.states)
-    sights, motions = _go_round(env, trial.qpos, views)
-    similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(sights.code, target.code)
-    scores = jnp.where(motions.is_found, similarity, -jnp.inf)
+    record = jax.lax.switch(number, [functools.partial(_record, methods, i) for i in numbers], trial.states)
+    is_over = ~is_running(record, args.threshold)
+    sights, motions, scores = _go_round(env, (trial.qpos, is_over), views, target, args.threshold)
     # Not after the view that ends the search, nor to those that only fill up the generation.
     is_asked = jnp.arange(num_views) < jnp.asarray([method.num_views for method in methods])[number]
     is_moved = motions.is_found & taken(scores, args.threshold) & is_asked
@@ -129,16 +130,39 @@ def _generation(
     return _Trial(states, camera, qpos, costs)
 
 
-def _go_round(env: ViewSearchEnv, qpos: Array, views: View) -> tuple[Sight, Motion]:
-    """Returns what is seen from `views` (f32[N] rad), taken one after the other from joints `qpos`, and the motions."""
+def _record(methods: tuple[Method, ...], number: int, states: tuple[Any, ...]) -> Record:
+    return methods[number].record(states[number])
+
+
+def _go_round(
+    env: ViewSearchEnv, now: tuple[Array, Array], views: View, target: Sight, threshold: Array
+) -> tuple[Sight, Motion, Array]:
+    """Looks at a generation of views, one after the other where paths are asked for.
+
+    Args:
+      env: the task.
+      now: joints f32[nq] where the arm stands, and bool[], whether the search is over.
+      views: View of f32[N] rad.
+      target: Sight of the target.
+      threshold: f32[], the score at which the search ends, and with it the motions.
+
+    Returns:
+      What is seen, the motions, and the scores f32[N].
+    """
+
+    def look(here: Array, is_over: Array, view: View) -> tuple[Sight, Motion, Array]:
+        sight, motion = env.go(view, here, is_over)
+        return sight, motion, jnp.where(motion.is_found, cosine_similarity(sight.code, target.code), -jnp.inf)
+
     if env.config.env.reachable == "ik":
-        return jax.vmap(env.go, in_axes=(0, None))(views, qpos)
+        return jax.vmap(look, in_axes=(None, None, 0))(*now, views)
 
-    def go_on(here: Array, view: View) -> tuple[Array, tuple[Sight, Motion]]:
-        sight, motion = env.go(view, here)
-        return jnp.where(motion.is_found, sight.qpos, here), (sight, motion)
+    def go_on(now: tuple[Array, Array], view: View) -> tuple[tuple[Array, Array], tuple[Sight, Motion, Array]]:
+        here, is_over = now
+        sight, motion, score = look(here, is_over, view)
+        return (jnp.where(motion.is_found, sight.qpos, here), is_over | (score >= threshold)), (sight, motion, score)
 
-    return jax.lax.scan(go_on, qpos, views)[1]
+    return jax.lax.scan(go_on, now, views)[1]
 
 
 def _follow(env: ViewSearchEnv, trial: _Trial, joints: Array, motions: Motion) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from vsearch_jax.config import Config
 from vsearch_jax.report import figures
 from vsearch_jax.report.style import styled
 from vsearch_jax.report.summary import SEARCHERS
-from vsearch_jax.report.table import FOOTNOTE, rows
+from vsearch_jax.report.table import FOOTNOTE, regime, rows
 from vsearch_jax.types import ReachabilityMap
 
 CAPTIONS = {
@@ -104,6 +104,7 @@ def _page(title: str, results: Mapping[str, Any], images: Mapping[str, bytes], c
         searchers=SEARCHERS.values(),
         rows=rows(results),
         footnote=FOOTNOTE,
+        how=regime(results),
         seeds=results["sac"]["seeds"],
         pictures=pictures,
         results=results,

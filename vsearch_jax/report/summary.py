@@ -43,6 +43,8 @@ def results(arrays: Mapping[str, Any], config: Config, wall_seconds: Mapping[str
     return {
         **searchers,
         "sac": pooled,
+        "reachable": config.env.reachable,
+        "motion": config.env.motion,
         "thesis": THESIS,
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
         "machine": {

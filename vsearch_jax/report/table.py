@@ -75,9 +75,17 @@ def rows(results: Mapping[str, Any]) -> list[tuple[str, list[Cell]]]:
     ]
 
 
+def regime(results: Mapping[str, Any]) -> str:
+    """Returns how the arm moved, in words."""
+    needed = "joints are" if results["reachable"] == "ik" else "a path is"
+    return f"{results['motion']} motion; a view is reachable where {needed} found"
+
+
 def print_table(results: Mapping[str, Any], console: Console) -> None:
     """Prints the table of results, searcher after searcher, and a line for each policy seed."""
-    table = Table(title="View search: ours beside the thesis", caption=FOOTNOTE, caption_justify="left")
+    table = Table(
+        title=f"View search: ours beside the thesis ({regime(results)})", caption=FOOTNOTE, caption_justify="left"
+    )
     table.add_column("")
     for heading in ("ours", "95 % interval", "thesis"):
         table.add_column(heading, justify="right")
