@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import os
 import re
@@ -12,6 +13,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
+import made_up
 import standin
 from vsearch_jax import checkpoint, cli, runner, video
 from vsearch_jax.config import Config
@@ -179,14 +181,24 @@ def test_resume_with_what_the_run_cannot_do_names_it_and_changes_nothing(
     assert contents(tmp_path) == before
 
 
-def test_a_target_out_of_reach_comes_with_the_map(
-    quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path
+@pytest.mark.parametrize("is_target", [True, False])
+def test_what_is_out_of_reach_comes_with_the_map(
+    quick: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    is_target: bool,
 ) -> None:
     out = tmp_path / "run"
     options = ["--preset", "smoke", "--evaluation.target-elevation-deg", "89"]
+    if not is_target:
+        some = made_up.reach()
+        nothing = dataclasses.replace(some, is_reachable=some.is_reachable & False, band=np.nan * some.band)
+        monkeypatch.setattr(runner, "init", lambda *args: dataclasses.replace(standin.init(*args), reach=nothing))
     message = fails(capsys, "train", *options, "--out", str(out))
     picture = tmp_path / "run-reachability.png"
-    assert "target_elevation_deg is 89" in message and f"{picture} shows" in message
+    assert ("target_elevation_deg is 89" if is_target else "reaches no elevation at every azimuth") in message
+    assert f"{picture} shows" in message
     assert picture.read_bytes().startswith(b"\x89PNG") and not any(out.iterdir())
 
 

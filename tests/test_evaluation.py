@@ -30,9 +30,19 @@ def state():
     return vs.init(jax.random.key(0), CONFIG)
 
 
-@pytest.fixture(scope="module")
-def results(state):
-    return jax.tree.map(np.asarray, vs.evaluate(state, CONFIG))
+@pytest.fixture(
+    scope="module",
+    params=[
+        ("ik", "kinematic"),
+        pytest.param(("path", "kinematic"), marks=pytest.mark.slow),
+        pytest.param(("path", "dynamic"), marks=pytest.mark.slow),
+    ],
+    ids="-".join,
+)
+def results(state, request):
+    reachable, motion = request.param
+    task = dataclasses.replace(CONFIG.env, reachable=reachable, motion=motion)
+    return jax.tree.map(np.asarray, vs.evaluate(state, dataclasses.replace(CONFIG, env=task)))
 
 
 def test_shapes(results):

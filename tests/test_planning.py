@@ -13,7 +13,7 @@ from planning_oracle import Oracle, free_joints
 from second_arm import MJCF
 from vsearch_jax import collision
 from vsearch_jax.arm import build_arm, clearance, forward_kinematics
-from vsearch_jax.config import PlanningConfig, SceneConfig
+from vsearch_jax.config import ConfigError, PlanningConfig, SceneConfig
 from vsearch_jax.planning import PlanningError, edge_is_free, rrt, rrt_connect, sample, start_limits, time_path
 from vsearch_jax.planning.edges import advance, edge_between
 from vsearch_jax.planning.proofs import is_free_between, look, motion_bounds, ways
@@ -113,15 +113,29 @@ def _ends(axes) -> np.ndarray:
     return np.stack([center - half_axis, center + half_axis])
 
 
-def test_bends_bound_the_second_derivatives_along_an_edge(problems):
-    arm, places = problems.arm, np.linspace(0.0, 1.0, 33, dtype=np.float32)
+@pytest.fixture(scope="module", params=["lwr", "second"])
+def any_arm(request, problems, tmp_path_factory):
+    """The LWR, and an arm with a slide and a branch beside the camera."""
+    if request.param == "lwr":
+        return problems.arm
+    path = tmp_path_factory.mktemp("arm") / "second.xml"
+    path.write_text(MJCF.replace('axis="0 1 1"/>', 'axis="0 1 1" range="-2 2"/>'))
+    return build_arm(build_scene(SceneConfig(arm=str(path))))
+
+
+def test_bends_bound_the_second_derivatives_along_an_edge(any_arm):
+    arm, places = any_arm, np.linspace(0.0, 1.0, 33, dtype=np.float32)
+    random, address = np.random.default_rng(3), np.asarray(any_arm.chain.address)
+    axes_along = jax.jit(jax.vmap(lambda q: look(arm, q).axes))
     largest = 0.0
-    for index in range(8):
-        start, change = problems.start[index], problems.goal[index] - problems.start[index]
-        axes = jax.jit(jax.vmap(lambda q: look(arm, q).axes))(start + places[:, None] * change)
-        ends = _ends(axes)
+    for _ in range(8):
+        start, goal = (np.array(arm.home) for _ in range(2))
+        for qpos in (start, goal):
+            qpos[address] = random.uniform(*(limit[address] for limit in start_limits(arm)))
+        change = goal - start
+        ends = _ends(axes_along((start + places[:, None] * change).astype(np.float32)))
         second = np.linalg.norm(ends[:, 2:] - 2.0 * ends[:, 1:-1] + ends[:, :-2], axis=-1).max(axis=(0, 1)) * 32.0**2
-        bend = np.asarray(motion_bounds(arm.planning_pairs, jnp.asarray(change[:7])).bend)
+        bend = np.asarray(motion_bounds(arm.planning_pairs, jnp.asarray(change[address], jnp.float32)).bend)
         assert np.all(second <= bend + 2e-3)  # of float32, magnified by 32^2
         largest = max(largest, (second / np.maximum(bend, 1e-3)).max())
     assert largest > 0.1
@@ -156,6 +170,23 @@ def test_nothing_touches_between_samples_that_prove_it(problems, part):
     assert is_proven.sum() > 1.3 * by_levers.sum()  # what the chords add
 
 
+def test_what_is_not_finite_spoils_no_other_edge(problems):
+    check = jax.jit(jax.vmap(lambda a, b: edge_is_free(problems.arm, a, b, CONFIG)))
+    goal = problems.goal.copy()
+    expected = np.asarray(check(problems.start, goal))
+    free = np.flatnonzero(expected)
+    for index, value in zip(free, (np.inf, -np.inf, np.nan), strict=False):
+        goal[index, 2] = value
+    is_free = np.asarray(check(problems.start, goal))
+    assert not is_free[free[:3]].any()
+    np.testing.assert_array_equal(np.delete(is_free, free[:3]), np.delete(expected, free[:3]))
+
+
+def test_a_resolution_that_float32_cannot_resolve_is_refused():
+    with pytest.raises(ConfigError, match="resolution is 1e-08; allowed"):
+        PlanningConfig(resolution=1e-8)
+
+
 def test_an_edge_advances_alone_as_it_does_in_a_batch(problems):
     arm = problems.arm
     starts, goals, rest = problems.start[:6, :7], problems.goal[:6, :7], problems.start[:6]
@@ -165,9 +196,11 @@ def test_an_edge_advances_alone_as_it_does_in_a_batch(problems):
         return edge.done, edge.num_probes, edge.is_blocked, edge.sample.gap
 
     together = jax.jit(jax.vmap(go_on))(starts, goals, rest)
+    in_pairs = jax.jit(jax.vmap(jax.vmap(go_on)))(*(x.reshape(3, 2, -1) for x in (starts, goals, rest)))
     alone = jax.jit(lambda *xs: jax.lax.map(lambda x: go_on(*x), xs))(starts, goals, rest)
-    for ours, theirs in zip(together, alone, strict=True):
+    for ours, theirs, nested in zip(together, alone, in_pairs, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
+        np.testing.assert_allclose(nested.reshape(ours.shape), theirs, atol=1e-4)
     assert np.any(np.asarray(together[0]) > 0.0) and np.any(together[2])
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
@@ -66,7 +67,7 @@ def _read(path: Path) -> tuple[str, np.ndarray]:
     return about, np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
 
 
-def _check_motions(search, config: vs.Config) -> None:
+def _check_motions(search) -> None:
     """Each motion leads on from where the last one ended, no faster than the joints can."""
     here = search.start
     for joints, seconds, is_reachable in zip(search.joints, search.seconds, search.is_reachable, strict=True):
@@ -89,7 +90,7 @@ def film(config: vs.Config, state: TrainState, tmp_path_factory: pytest.TempPath
 def test_a_film_shows_the_search_in_real_time(config: vs.Config, state: TrainState, film) -> None:
     out, told = film
     search = jax.tree.map(np.asarray, film_search(state, None, _moving(config, "kinematic")))
-    _check_motions(search, config)
+    _check_motions(search)
     assert search.is_reachable.all() and search.num_steps == NUM_STEPS
     about, frames = _read(out)
     assert re.search(rf"Video: h264 .*yuv420p.* {FPS} fps", about), about
@@ -128,7 +129,7 @@ def test_the_film_is_of_the_search_that_the_task_makes(config: vs.Config, state:
     search, recorded = (
         jax.tree.map(np.asarray, f) for f in (film_search(state, None, config), record_search(state, config))
     )
-    _check_motions(search, config)
+    _check_motions(search)
     np.testing.assert_allclose(search.similarity, recorded["similarity"], atol=1e-4)
     assert search.num_steps == recorded["num_steps"] == NUM_STEPS
 
@@ -148,8 +149,6 @@ def test_a_dynamic_film_shows_where_the_dynamics_take_the_arm(config: vs.Config,
 @pytest.mark.parametrize(("arm", "height"), [("lwr", 1.355), ("ur5e", 1.0), ("lwr", 3.0)])
 @pytest.mark.parametrize("size", [(72, 64), (64, 200)])
 def test_the_overview_holds_arm_mount_and_object_and_no_more(arm: str, height: float, size: tuple[int, int]) -> None:
-    import mujoco
-
     scene = build_scene(SceneConfig(arm=arm, mount_height=height))
     model, random = scene.mj_model, np.random.default_rng(0)
     qpos = random.uniform(*model.jnt_range.T, (40, model.nq))

@@ -38,8 +38,9 @@ def _materialize_jvp(primals: tuple[Any, Array], tangents: tuple[Any, Any]) -> t
 
 
 def unknown_zero(lengths: Array) -> Array:
-    """Returns i32[] 0, computed from `lengths` (any shape), none of which is beyond 1e30.
+    """Returns i32[] 0, computed from `lengths` (any shape).
 
     They must be known at run time only: what the compiler can compute is no secret to it.
     """
-    return jnp.any(jax.lax.stop_gradient(lengths) > 1e30).astype(jnp.int32)
+    lengths = jax.lax.stop_gradient(lengths)
+    return jnp.any(jnp.where(lengths < 1e30, lengths, 0.0) > 1e30).astype(jnp.int32)

@@ -145,11 +145,12 @@ def run_eval(command: Eval) -> None:
             f"{command.run} was trained with env.reachable {trained.env.reachable} and env.motion "
             f"{trained.env.motion}; name a folder for the results of another evaluation with --out"
         )
-    if command.out is not None:
-        claim(command.out)
     with held(command.run):
         with console.status("reading the run"):
             state = runner.resume(command.run, trained)
+        runner.check_finished(command.run, state, trained)
+        if command.out is not None:
+            claim(command.out)
         _evaluate(command.run, state, config, console, command.out)
 
 

@@ -86,7 +86,7 @@ def pass_through(
     Returns:
       Joints f32[F, nq] rad or m, and f32[] s, when the arm has come to stand.
     """
-    total = duration(trajectory) + config.settling_time
+    total = _total(trajectory, config.settling_time)
 
     def go_on(data: mjx.Data, time: Array) -> tuple[mjx.Data, Array]:
         end = jnp.minimum(time, total)
@@ -96,6 +96,12 @@ def pass_through(
         return data, data.qpos
 
     return jax.lax.scan(go_on, _at_start(arm, trajectory), times)[1], total
+
+
+def _total(trajectory: Trajectory, settling_time: Array | float) -> Array:
+    """Returns f32[] s until the arm has settled, 0 where it does not move."""
+    seconds = duration(trajectory)
+    return jnp.where(seconds > 0.0, seconds + settling_time, 0.0)
 
 
 def _at_start(arm: Arm, trajectory: Trajectory) -> mjx.Data:
@@ -115,8 +121,7 @@ def _follow(arm: Arm, model: mjx.Model, trajectory: Trajectory, data: mjx.Data) 
 
 @jax.custom_batching.sequential_vmap
 def _run(arm: Arm, model: mjx.Model, trajectory: Trajectory, settling_time: Array) -> Execution:
-    seconds = duration(trajectory)
-    total = jnp.where(seconds > 0.0, seconds + settling_time, 0.0)
+    total = _total(trajectory, settling_time)
 
     def step(state: tuple[mjx.Data, Array, Array]) -> tuple[mjx.Data, Array, Array]:
         data, peak, energy = state

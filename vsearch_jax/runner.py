@@ -57,7 +57,10 @@ def _check_reach(run: Path, state: TrainState, config: Config) -> None:
         check_target(state.reach, config)
     except ConfigError as error:
         picture = run.with_name(f"{run.name}-reachability.png")
-        report.reachability(state.reach).savefig(picture)
+        try:
+            run_folder.write(picture, report.png(report.reachability(state.reach)))
+        except OSError:  # the disk is full: what is wrong with the config counts more
+            raise error from None
         raise ConfigError(f"{error}; {picture} shows what it reaches") from None
 
 

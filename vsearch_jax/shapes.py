@@ -19,7 +19,7 @@ Vector = tuple[Array, Array, Array]
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 # 0.618^14 = 1e-3 of the axis; near its minimum the distance changes by far less. The ends are looked at too.
 SEARCH_ITERATIONS = 14
-# Tangents from both ends of the bracket: what is left after these is some 0.03 mm, on the safe side.
+# Tangents from both ends of the bracket: for axes as long as an arm's some 0.1 mm is left, on the safe side.
 TANGENT_ITERATIONS = 6
 # Newton's steps from the left of a convex sum converge quadratically, and what is left shortens the distance.
 NEWTON_ITERATIONS = 6
@@ -114,10 +114,11 @@ def _larger(a: Array, b: Array, is_taken: Array) -> Array:
 
 
 def segment_cylinder_distance(center: Vector, half_axis: Vector, radius: Array, half_length: Array) -> Array:
-    """Returns the distance in m of a segment from a cylinder about z, or some 0.03 mm less; 0 where it passes through.
+    """Returns the distance in m of a segment from a cylinder about z, or a little less; 0 where it passes through.
 
-    The distance is convex along the segment, so it lies above its tangents. Where those of the two ends of a bracket
-    meet is the next place to look (Kelley's cutting planes, in one dimension).
+    For segments of half a metre it is some 0.1 mm less at most. The distance is convex along the segment, so it lies
+    above its tangents. Where those of the two ends of a bracket meet is the next place to look (Kelley: cutting
+    planes, in one dimension).
 
     Args:
       center: m, the segment's middle in the cylinder's frame.

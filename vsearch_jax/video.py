@@ -82,7 +82,10 @@ def make_video(
     search: FilmedSearch = jax.tree.map(np.asarray, in_thread(film_search, state, key, config))
     longest = float(search.seconds.max())
     if longest > MOST_SECONDS:
-        raise report.FilmError(f"a motion takes {longest:.0f} s; a film holds {MOST_SECONDS} s of each at most")
+        raise report.FilmError(
+            f"a motion takes {longest:.0f} s and a film holds {MOST_SECONDS} s of each at most; film another search "
+            "with --seed, or raise the speeds (`user` of the joints) in the arm's file"
+        )
     plan = _plan(search)
     frames = _frames(state, search, plan, config, height)
     num_frames = report.write_film(out, frames, FPS, (height, height * 16 // 9))

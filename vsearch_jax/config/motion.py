@@ -78,7 +78,8 @@ class PlanningConfig:
     """Seconds that a dynamic arm is given at the end of a motion."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "num_nodes", "max_iterations", "step", "resolution", "acceleration_time")
+        require_positive(self, "num_nodes", "max_iterations", "step", "acceleration_time")
+        require(self, "resolution", 1e-4 <= self.resolution <= 0.1, "from 0.0001 to 0.1 m")
         require(self, "settling_time", self.settling_time >= 0.0, "0 or more")
         require(self, "num_shortcuts", self.num_shortcuts >= 0, "0 or more")
         require(self, "max_waypoints", self.max_waypoints >= 3, "3 or more")

@@ -133,15 +133,15 @@ class ViewSearchEnv(Env):
         )
 
     def step(self, state: State, action: Array) -> State:
-        """Returns the state after moving by `action` (f32[2], clipped to [-1, 1]); after the end the arm stays."""
-        moved, motion = self.go(self.commanded(state, action), episode_of(state).sight.qpos, state.done > 0.0)
-        return self.arrive(state, moved, motion)
+        """Returns the state after moving by `action` (f32[2], clipped to [-1, 1]); after the end nothing changes."""
+        is_over = state.done > 0.0
+        moved, motion = self.go(self.commanded(state, action), episode_of(state).sight.qpos, is_over)
+        return jax.tree.map(lambda new, old: jnp.where(is_over, old, new), self.arrive(state, moved, motion), state)
 
     def commanded(self, state: State, action: Array) -> View:
         """Returns the view to which `action` (f32[2], clipped to [-1, 1]) leads, whether or not the arm reaches it."""
         old = episode_of(state).sight.view
         delta = jnp.clip(action, -1.0, 1.0) * math.radians(self.config.env.action_scale_deg)
-        delta = jnp.where(state.done > 0.0, 0.0, delta)
         return View(wrap_angle(old.azimuth + delta[0]), old.elevation + delta[1])
 
     def arrive(self, state: State, moved: Sight, motion: Motion) -> State:
@@ -221,14 +221,14 @@ class ViewSearchEnv(Env):
         view, qpos = self.sample_pose(key)
         return self.see(view, qpos)
 
-    def go(self, view: View, qpos: Array, is_over: Array | bool = False) -> tuple[Sight, Motion]:
+    def go(self, view: View, qpos: Array, is_over: Array | None = None) -> tuple[Sight, Motion]:
         """Returns what is seen from `view`, and the motion there from joints `qpos` (f32[nq]).
 
-        Where the search `is_over` (bool[]) the arm stays, since a motion takes long to plan and to compute; what is
-        returned is then of no use.
+        Where the search `is_over` (bool[]) or no joints are found the arm stays, since motions take long to compute;
+        what is returned is then of no use.
         """
         joints, is_reachable = self.solve(view, qpos)
-        joints = jnp.where(is_over, qpos, joints)
+        joints = jnp.where(is_reachable if is_over is None else is_reachable & ~is_over, joints, qpos)
         has_path = self.config.env.reachable == "path"
         joints, motion = self.move(qpos, joints) if has_path else (joints, self.straight(qpos, joints))
         is_found = is_reachable & motion.is_found

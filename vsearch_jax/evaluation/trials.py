@@ -14,7 +14,7 @@ from vsearch_jax.env import ViewSearchEnv
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
-from vsearch_jax.search.common import Record, is_running, taken, to_result
+from vsearch_jax.search.common import is_running, taken, to_result
 from vsearch_jax.types import Camera, SearchResult, Sight, View
 
 
@@ -88,8 +88,7 @@ def _trial(
     body = functools.partial(_generation, env, methods, (number, key), target, args)
 
     def goes_on(trial: _Trial) -> Array:
-        records = [method.record(state) for method, state in zip(methods, trial.states, strict=True)]
-        return jnp.stack([is_running(record, args.threshold) for record in records])[number]
+        return _goes_on(methods, number, args, trial)
 
     return jax.lax.while_loop(goes_on, body, _Trial(states, start.camera, start.qpos, jnp.zeros(2)))
 
@@ -118,11 +117,11 @@ def _generation(
 
     numbers = range(len(methods))
     views, states = jax.lax.switch(number, [functools.partial(ask, i) for i in numbers], trial.states)
-    record = jax.lax.switch(number, [functools.partial(_record, methods, i) for i in numbers], trial.states)
-    is_over = ~is_running(record, args.threshold)
-    sights, motions, scores = _go_round(env, (trial.qpos, is_over), views, target, args.threshold)
-    # Not after the view that ends the search, nor to those that only fill up the generation.
+    # Those that only fill up the generation are not.
     is_asked = jnp.arange(num_views) < jnp.asarray([method.num_views for method in methods])[number]
+    is_over = ~_goes_on(methods, number, args, trial)
+    sights, motions, scores = _go_round(env, (trial.qpos, is_over), (views, is_asked), target, args.threshold)
+    # Nor is anything after the view that ends the search.
     is_moved = motions.is_found & taken(scores, args.threshold) & is_asked
     qpos, costs = _follow(env, trial, sights.qpos, motions._replace(is_found=is_moved))
     states, best = jax.lax.switch(number, [functools.partial(tell, i) for i in numbers], states, views, scores)
@@ -130,19 +129,21 @@ def _generation(
     return _Trial(states, camera, qpos, costs)
 
 
-def _record(methods: tuple[Method, ...], number: int, states: tuple[Any, ...]) -> Record:
-    return methods[number].record(states[number])
+def _goes_on(methods: tuple[Method, ...], number: Array, args: SearchArgs, trial: _Trial) -> Array:
+    """Returns bool[]: searcher `number` is not done with the trial."""
+    records = [method.record(state) for method, state in zip(methods, trial.states, strict=True)]
+    return jnp.stack([is_running(record, args.threshold) for record in records])[number]
 
 
 def _go_round(
-    env: ViewSearchEnv, now: tuple[Array, Array], views: View, target: Sight, threshold: Array
+    env: ViewSearchEnv, now: tuple[Array, Array], asked: tuple[View, Array], target: Sight, threshold: Array
 ) -> tuple[Sight, Motion, Array]:
     """Looks at a generation of views, one after the other where paths are asked for.
 
     Args:
       env: the task.
       now: joints f32[nq] where the arm stands, and bool[], whether the search is over.
-      views: View of f32[N] rad.
+      asked: View of f32[N] rad, and bool[N], whether it is to be looked at: if not, the arm need not move.
       target: Sight of the target.
       threshold: f32[], the score at which the search ends, and with it the motions.
 
@@ -150,19 +151,22 @@ def _go_round(
       What is seen, the motions, and the scores f32[N].
     """
 
-    def look(here: Array, is_over: Array, view: View) -> tuple[Sight, Motion, Array]:
-        sight, motion = env.go(view, here, is_over)
+    def look(here: Array, is_over: Array, asked: tuple[View, Array]) -> tuple[Sight, Motion, Array]:
+        view, is_asked = asked
+        sight, motion = env.go(view, here, is_over | ~is_asked)
         return sight, motion, jnp.where(motion.is_found, cosine_similarity(sight.code, target.code), -jnp.inf)
 
     if env.config.env.reachable == "ik":
-        return jax.vmap(look, in_axes=(None, None, 0))(*now, views)
+        return jax.vmap(look, in_axes=(None, None, 0))(*now, asked)
 
-    def go_on(now: tuple[Array, Array], view: View) -> tuple[tuple[Array, Array], tuple[Sight, Motion, Array]]:
+    def go_on(
+        now: tuple[Array, Array], asked: tuple[View, Array]
+    ) -> tuple[tuple[Array, Array], tuple[Sight, Motion, Array]]:
         here, is_over = now
-        sight, motion, score = look(here, is_over, view)
+        sight, motion, score = look(here, is_over, asked)
         return (jnp.where(motion.is_found, sight.qpos, here), is_over | (score >= threshold)), (sight, motion, score)
 
-    return jax.lax.scan(go_on, now, views)[1]
+    return jax.lax.scan(go_on, now, asked)[1]
 
 
 def _follow(env: ViewSearchEnv, trial: _Trial, joints: Array, motions: Motion) -> tuple[Array, Array]:

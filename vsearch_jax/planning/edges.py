@@ -52,7 +52,7 @@ class Edge(NamedTuple):
 
 
 def edge_between(arm: Arm, start: Array, end: Array) -> Edge:
-    """Returns the edge from `start` to `end` (f32[J] each), of which nothing is proven yet; the start must be free."""
+    """Returns the edge from `start` to `end` (f32[J] each), of which nothing is proven yet."""
     pairs = arm.planning_pairs
     still = jnp.zeros(pairs.radius.shape[0])
     sample = Sample(jnp.zeros(pairs.part.shape[0]), Axes((still, still, still), (still, still, still)))
@@ -96,8 +96,9 @@ def _advance_once(arm: Arm, qpos: Array, bounds: Bounds, resolution: float, edge
     place = jnp.where(is_probing, probe, edge.done + step)
     sample = look(arm, qpos.at[arm.chain.address].set(edge.start + place[None] * edge.change))
     is_clear = jnp.all(sample.gap > 0.0, axis=0)
+    step = place - edge.done  # as it was rounded
     way, fall = ways(edge.sample.axes, sample.axes)
-    is_proven = ~is_probing & is_clear & is_free_between(pairs, (edge.sample, sample), step, bounds, way)
+    is_proven = ~is_probing & (step > 0.0) & is_clear & is_free_between(pairs, (edge.sample, sample), step, bounds, way)
     is_new = is_proven | is_probing
     share = jnp.where(is_probing, PROBES[-2] - PROBES[-1], jnp.maximum(step, 1e-9))
     new = edge._replace(
@@ -138,8 +139,9 @@ def edge_is_free(arm: Arm, start: Array, end: Array, config: PlanningConfig) -> 
 
     Args:
       arm: the arm.
-      start: f32[nq] rad or m; it must be free itself.
-      end: f32[nq] rad or m; joints that do not move the camera stay as they are at the start.
+      start: f32[nq] rad or m.
+      end: f32[nq] rad or m; joints that do not move the camera stay as they are at the start. That both are inside
+        the limits is not looked at.
       config: the resolution.
     """
     address = arm.chain.address

@@ -98,7 +98,7 @@ def is_free_between(pairs: Pairs, ends: tuple[Sample, Sample], step: Array, boun
     """
     wide = functools.partial(widened, batch=step.ndim)
     gap, step = ends[0].gap + ends[1].gap, step[None]
-    by_levers = gap >= bounds.rate * step * (1.0 + 1e-4)
+    by_levers = gap >= bounds.rate * step + ROUNDING
     stray = (bounds.bend * step * step)[pairs.mover]
     by_chord = gap >= way[pairs.mover] + 0.25 * stray + ROUNDING
     by_height = jnp.minimum(ends[0].gap, ends[1].gap) >= 0.125 * stray + ROUNDING

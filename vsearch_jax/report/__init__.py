@@ -2,7 +2,7 @@
 
 from vsearch_jax.report.figures import mount_heights, reachability, search_strip
 from vsearch_jax.report.film import FilmError, FilmPage, Moment, write_film
-from vsearch_jax.report.page import draw, write
+from vsearch_jax.report.page import draw, png, write
 from vsearch_jax.report.summary import SEARCHERS, results
 from vsearch_jax.report.table import print_table
 
@@ -13,6 +13,7 @@ __all__ = [
     "Moment",
     "draw",
     "mount_heights",
+    "png",
     "print_table",
     "reachability",
     "results",

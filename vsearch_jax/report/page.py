@@ -78,7 +78,7 @@ def write(folder: Path, results: Mapping[str, Any], pictures: Mapping[str, Figur
     """
     text = json.dumps(results, indent=2, allow_nan=False) + "\n"  # before anything is written over
     (folder / "figures").mkdir(exist_ok=True)
-    images = {name: _png(picture) for name, picture in pictures.items()}
+    images = {name: png(picture) for name, picture in pictures.items()}
     for name, image in images.items():
         run_folder.write(folder / "figures" / f"{name}.png", image)
     run_folder.write(folder / "report.html", _page(folder.absolute().name, results, images, config))
@@ -87,7 +87,8 @@ def write(folder: Path, results: Mapping[str, Any], pictures: Mapping[str, Figur
 
 
 @styled
-def _png(picture: Figure) -> bytes:
+def png(picture: Figure) -> bytes:
+    """Returns the picture as a PNG file."""
     buffer = io.BytesIO()
     picture.savefig(buffer, format="png")
     return buffer.getvalue()
