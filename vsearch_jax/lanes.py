@@ -15,8 +15,8 @@ from jax import Array
 
 # Lanes are refilled once this share of them has finished: refilling costs about as much as a few steps.
 REFILL_SHARE = 8
-# At the end this share of the lanes goes on alone.
-TAIL_SHARE = 8
+# At the end this share of the lanes goes on alone, and of those again.
+TAIL_SHARES = (4, 4)
 
 
 class Job(NamedTuple):
@@ -60,13 +60,14 @@ def run(job: Job, problems: Any, order: tuple[Array, Array], states: Any, result
     num_problems, num_lanes = order[0].shape[0], jax.tree.leaves(states)[0].shape[0]
     state = _Run(states, jnp.full(num_lanes, num_problems, jnp.int32), jnp.int32(0), results)
     # When the queue is empty and few are left, these go on alone: all lanes cost the same, idle or not.
-    few = num_lanes // TAIL_SHARE if job.has_stragglers else 0
-    state = _loop(job, problems, order, state, few)
-    if few:
+    for share in TAIL_SHARES if job.has_stragglers else ():
+        few = state.held.shape[0] // share
+        if few == 0:
+            break
+        state = _loop(job, problems, order, state, few)
         busy = jnp.argsort(state.held >= num_problems)[:few]
         state = state._replace(states=_rows(state.states, busy), held=state.held[busy])
-        state = _loop(job, problems, order, state, 0)
-    return state.results
+    return _loop(job, problems, order, state, 0).results
 
 
 def _loop(job: Job, problems: Any, order: tuple[Array, Array], state: _Run, few: int) -> _Run:

@@ -105,6 +105,7 @@ def _straight(arm: Arm, config: PlanningConfig, problems: Problem, is_open: Arra
         lambda problem, edge: advance(arm, edge, problem.qpos, config),
         is_settled,
         lambda _, edge: is_whole(edge),
+        has_stragglers=False,
     )
     origin = jnp.zeros(problems.start.shape[1])
     states = _copies(edge_between(arm, origin, origin), is_open)
@@ -135,6 +136,7 @@ def _shorten(arm: Arm, config: PlanningConfig, paths: Crooked, is_open: Array) -
         functools.partial(shortcuts.step, arm, config),
         functools.partial(shortcuts.is_done, config),
         lambda _, state: state.waypoints,
+        has_stragglers=False,
     )
     states = _copies(shortcuts.empty(arm, config), is_open)
     return lanes.run(job, paths, lanes.in_order(is_open), states, paths.waypoints)
