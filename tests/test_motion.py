@@ -109,5 +109,5 @@ def test_dynamics_without_actuators_are_refused(tmp_path):
 
 
 def test_dynamics_without_a_path_are_refused():
-    with pytest.raises(ConfigError, match="kinematic where reachable is 'ik'"):
+    with pytest.raises(ConfigError, match=r"kinematic where env\.reachable is 'ik'"):
         EnvConfig(motion="dynamic")

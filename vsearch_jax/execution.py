@@ -14,7 +14,7 @@ from mujoco import mjx
 
 from vsearch_jax.arm import Arm
 from vsearch_jax.config import PlanningConfig
-from vsearch_jax.planning import duration, sample
+from vsearch_jax.planning import check_speeds, duration, sample
 from vsearch_jax.scene import Scene, SceneError
 from vsearch_jax.types import Trajectory
 
@@ -35,12 +35,14 @@ class Execution(NamedTuple):
     time: Array
 
 
-def check_actuators(scene: Scene) -> None:
+def check_drive(scene: Scene, arm: Arm) -> None:
     """Checks that each joint that moves the camera can be driven.
 
     Raises:
       SceneError: a joint has no position actuator of its own.
+      PlanningError: a joint has no speed limit.
     """
+    check_speeds(arm)
     model = scene.mj_model
     is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     gain = model.actuator_gainprm[:, 0]

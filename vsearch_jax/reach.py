@@ -42,7 +42,7 @@ def draw_reach(
     tried = np.arange(int((high - low) / step + 1e-6) + 1) * step + low
     mounts = scan_mounts(dataclasses.replace(Config(), scene=scene, ik=ik), tried.tolist(), band_deg)
     best = best_mount(mounts)
-    report.reachability(best.reach).savefig(out / "reachability.png")
+    report.reachability(best.reach, band_deg).savefig(out / "reachability.png")
     curve = report.mount_heights([mount.height for mount in mounts], [mount.coverage for mount in mounts], best.height)
     curve.savefig(out / "mount_heights.png")
     views = f"views from {band_deg[0]:g} to {band_deg[1]:g} degrees of elevation"
@@ -51,7 +51,12 @@ def draw_reach(
             f"arm {scene.arm!r} reaches none of the {views} around object {scene.object!r} from any height from "
             f"{low:g} to {high:g} m; {out / 'reachability.png'} shows what it does reach"
         )
+    band = np.rad2deg(np.asarray(best.reach.band))
+    everywhere = "no elevation" if np.isnan(band).any() else f"elevations from {band[0]:.0f} to {band[1]:.0f} degrees"
+    # A curve that still rises where the heights end says nothing of what is beyond.
+    is_cut = best.coverage < 1.0 and len(tried) > 1 and best.height in (mounts[0].height, mounts[-1].height)
+    beyond = ", at the end of the heights tried: wider ones may do better" if is_cut else ""
     return (
-        f"mount height {best.height:.3g} m: {100 * best.coverage:.1f} % of the {views} are in reach; see "
-        f"{out / 'reachability.png'}"
+        f"mount height {best.height:.3g} m{beyond}: {100 * best.coverage:.1f} % of the {views} are in reach, at every "
+        f"azimuth {everywhere}, which is the band that `vsearch train` searches; see {out / 'reachability.png'}"
     )

@@ -116,7 +116,7 @@ class EnvConfig:
         require(self, "threshold", -1.0 < self.threshold < 1.0, "between -1 and 1")
         require(self, "reachable", self.reachable in ("ik", "path"), "ik or path")
         require(self, "motion", self.motion in ("kinematic", "dynamic"), "kinematic or dynamic")
-        allowed = "kinematic where reachable is 'ik': dynamics need a path"
+        allowed = "kinematic where env.reachable is 'ik'; dynamics need env.reachable 'path'"
         require(self, "motion", self.reachable == "path" or self.motion == "kinematic", allowed)
         require(self, "action_scale_deg", 0.0 < self.action_scale_deg <= 180.0, "above 0, at most 180")
         require_positive(self, "episode_length")

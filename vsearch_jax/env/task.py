@@ -15,7 +15,7 @@ from vsearch_jax import render
 from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import Config
 from vsearch_jax.env.episode import check_band, episode_of, observe
-from vsearch_jax.execution import check_actuators, execute
+from vsearch_jax.execution import check_drive, execute
 from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.planning import (
     Motion,
@@ -74,7 +74,7 @@ class ViewSearchEnv(Env):
           reach: the arm's reachability map; computed by default.
 
         Raises:
-          SceneError: arm or object can't be loaded.
+          SceneError, PlanningError: arm or object can't be loaded, or the arm can't be driven as its motion needs it.
           ConfigError: the arm reaches no elevation at every azimuth (not under a trace, where nothing is known yet).
         """
         self.config = config if config is not None else Config.preset("cpu")
@@ -82,7 +82,7 @@ class ViewSearchEnv(Env):
         self.center = jnp.asarray(self.scene.center, jnp.float32)
         self.arm = build_arm(self.scene)
         if self.config.env.motion == "dynamic":
-            check_actuators(self.scene)
+            check_drive(self.scene, self.arm)
         self.render_scene = render.compile_scene(self.scene.mj_model)
         if not set(self.scene.object_geom_ids) & set(self.render_scene.geom_ids):
             raise SceneError(f"object {self.config.scene.object!r} has no visible geom in the groups 0 to 2")

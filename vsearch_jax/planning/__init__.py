@@ -5,11 +5,20 @@ from vsearch_jax.planning.ik import ik
 from vsearch_jax.planning.reachability import nearest_cell, reachability_map, solve_view
 from vsearch_jax.planning.rrt import rrt, rrt_connect
 from vsearch_jax.planning.starts import ik_from_starts, start_limits
-from vsearch_jax.planning.trajectory import Motion, PlanningError, duration, sample, straight_duration, time_path
+from vsearch_jax.planning.trajectory import (
+    Motion,
+    PlanningError,
+    check_speeds,
+    duration,
+    sample,
+    straight_duration,
+    time_path,
+)
 
 __all__ = [
     "Motion",
     "PlanningError",
+    "check_speeds",
     "duration",
     "edge_is_free",
     "ik",

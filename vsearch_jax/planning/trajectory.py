@@ -59,10 +59,7 @@ def time_path(arm: Arm, path: Path, config: PlanningConfig) -> Trajectory:
     Raises:
       PlanningError: the model gives no speed limit for a joint.
     """
-    if arm.without_speed:
-        raise PlanningError(
-            f"no speed limit for joint {', '.join(arm.without_speed)}: give the joint's `user` in rad/s (or m/s)"
-        )
+    check_speeds(arm)
     points = path.waypoints[:, arm.chain.address]
     change = jnp.diff(points, axis=0)
     lengths = jnp.sqrt(jnp.maximum(jnp.sum(change * change, axis=-1), 1e-16))
@@ -81,6 +78,17 @@ def time_path(arm: Arm, path: Path, config: PlanningConfig) -> Trajectory:
     durations = jnp.where(sizes > 0.0, 2.0 * sizes / jnp.maximum(speed[:-1] + speed[1:], 1e-9), 0.0)
     times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(durations)])
     return blank._replace(sizes=sizes, times=times, squared_speeds=squared)
+
+
+def check_speeds(arm: Arm) -> None:
+    """Checks that each joint that moves the camera has a speed limit.
+
+    Raises:
+      PlanningError: the model gives none for a joint.
+    """
+    if arm.without_speed:
+        names = ", ".join(arm.without_speed)
+        raise PlanningError(f"no speed limit for joint {names}: give the joint's `user` in rad/s (or m/s), above 0")
 
 
 def straight_duration(arm: Arm, start: Array, goal: Array, config: PlanningConfig) -> Array:

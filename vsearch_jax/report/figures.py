@@ -22,8 +22,13 @@ THESIS_BAND_DEG = (40, 70)
 
 
 @styled
-def reachability(reach: ReachabilityMap) -> Figure:
-    """Draws which views the arm can reach, and the band that it reaches at every azimuth."""
+def reachability(reach: ReachabilityMap, wanted_deg: tuple[float, float] | None = None) -> Figure:
+    """Draws which views the arm can reach, and the band that it reaches at every azimuth.
+
+    Args:
+      reach: the map.
+      wanted_deg: lowest and highest elevation that are wanted, in degrees; the thesis's band by default.
+    """
     azimuths, elevations = np.rad2deg(reach.azimuths), np.rad2deg(reach.elevations)
     figure = Figure(figsize=(8, 3.6))
     axes = figure.add_subplot()
@@ -43,14 +48,15 @@ def reachability(reach: ReachabilityMap) -> Figure:
     low, high = np.rad2deg(reach.band)
     ends = axes.get_xlim()
     ours = axes.hlines([low, high], *ends, color=COLORS["sac"])
-    thesis = axes.hlines(THESIS_BAND_DEG, *ends, color=INK, linestyle="--", linewidth=1)
+    name, lines = ("thesis", THESIS_BAND_DEG) if wanted_deg is None else ("wanted", wanted_deg)
+    other = axes.hlines(lines, *ends, color=INK, linestyle="--", linewidth=1)
     axes.set(
         xlabel="azimuth (°)", ylabel="elevation (°)", title="Views that the arm can reach", xticks=range(0, 361, 45)
     )
     axes.set_xlim(ends)
-    handles = [Patch(color=REACHABLE), Patch(color=UNREACHABLE), ours, thesis]
+    handles = [Patch(color=REACHABLE), Patch(color=UNREACHABLE), ours, other]
     band = "none" if np.isnan(low) else f"{low:.0f}–{high:.0f}°"
-    labels = ["reachable", "not reachable", f"at every azimuth: {band}", "thesis: 40–70°"]
+    labels = ["reachable", "not reachable", f"at every azimuth: {band}", f"{name}: {lines[0]:g}–{lines[1]:g}°"]
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
 

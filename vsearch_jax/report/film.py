@@ -77,8 +77,8 @@ class FilmPage:
             figure.text(x, y + height_ + 0.012, name, size=11)
         edge = {"transform": figure.transFigure, "fill": False, "linewidth": 5, "edgecolor": COLORS["cma_es"]}
         self._edge = figure.add_artist(Rectangle(_WRIST[:2], *_WRIST[2:], animated=True, **edge))
-        places = ((_WRIST[0], 0.947, 17, "left"), (_WRIST[0], 0.475, 13, "left"), (_RIGHT, 0.475, 13, "right"))
-        self._texts = [figure.text(x, y, "", size=size, ha=ha, animated=True) for x, y, size, ha in places]
+        places = ((0.947, 17), (0.475, 13), (0.443, 11))
+        self._texts = [figure.text(_WRIST[0], y, "", size=size, animated=True) for y, size in places]
         self._lines = _curve(figure.add_axes(_CURVE), axes_limits, threshold)
         self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(figure.bbox)
