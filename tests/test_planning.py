@@ -170,6 +170,28 @@ def test_nothing_touches_between_samples_that_prove_it(problems, part):
     assert is_proven.sum() > 1.3 * by_levers.sum()  # what the chords add
 
 
+def test_an_arm_that_almost_touches_gets_away(problems):
+    """From a tenth of the resolution off, straight back to where it came from, but no nearer to what is there."""
+    arm, look_there = problems.arm, jax.jit(lambda q: jnp.min(look(problems.arm, q).gap))
+    is_free = jax.jit(lambda a, b: edge_is_free(arm, a, b, CONFIG))
+    count = 0
+    for start, goal in zip(problems.start, problems.goal, strict=True):
+        places = np.linspace(0.0, 1.0, 200, dtype=np.float32)
+        gaps = np.array([look_there(start + place * (goal - start)) for place in places])
+        if gaps.min() > 0.0 or gaps[0] < 0.01 or np.any(np.diff(gaps[: np.argmax(gaps <= 0.0) + 1]) > 0.0):
+            continue
+        low, high = places[np.argmax(gaps <= 0.0) - 1], places[np.argmax(gaps <= 0.0)]
+        for _ in range(40):
+            middle = (low + high) / 2
+            low, high = (low, middle) if look_there(start + middle * (goal - start)) < 2e-4 else (middle, high)
+        near = start + low * (goal - start)
+        assert 1e-4 < look_there(near) < CONFIG.resolution / 10
+        assert is_free(near, start)
+        assert not is_free(near, goal)
+        count += 1
+    assert count >= 3
+
+
 def test_what_is_not_finite_spoils_no_other_edge(problems):
     check = jax.jit(jax.vmap(lambda a, b: edge_is_free(problems.arm, a, b, CONFIG)))
     goal = problems.goal.copy()

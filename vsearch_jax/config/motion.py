@@ -67,7 +67,7 @@ class PlanningConfig:
     step: float = 3.0
     """Length in rad of a tree's random edges."""
     resolution: float = 0.004
-    """How near in m the arm may pass before an edge is given up as blocked; see `planning.edge_is_free`."""
+    """How near in m the arm may come before an edge that leads nearer is given up; see `planning.edge_is_free`."""
     num_shortcuts: int = 64
     """Attempts to shorten a path."""
     max_waypoints: int = 48

@@ -17,7 +17,7 @@ from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.proofs import Bounds, Sample, is_free_between, look, motion_bounds, ways
 
 # A step is as long as if the next sample were nearly as far from everything as this one, and the speed the same. Where
-# that fails, a shorter one is tried, then one that is safe if the next sample is as near as the resolution.
+# that fails, a shorter one is tried, then one that is safe wherever the next sample touches nothing.
 BOLD = (1.3, 0.7, 1.0)
 LAST_TRY = len(BOLD) - 1
 # Where an edge is looked at first: most of those that are blocked show it here, for a few samples instead of the dozens
@@ -100,6 +100,9 @@ def _advance_once(arm: Arm, qpos: Array, bounds: Bounds, resolution: float, edge
     way, fall = ways(edge.sample.axes, sample.axes)
     is_proven = ~is_probing & (step > 0.0) & is_clear & is_free_between(pairs, (edge.sample, sample), step, bounds, way)
     is_new = is_proven | is_probing
+    # Steps that come nearer and nearer would never end; those of an arm that starts near something lead away.
+    nearest, before = jnp.min(sample.gap, axis=0), jnp.min(edge.sample.gap, axis=0)
+    is_too_near = is_proven & (nearest < resolution) & (nearest < before) & (place < 1.0)
     share = jnp.where(is_probing, PROBES[-2] - PROBES[-1], jnp.maximum(step, 1e-9))
     new = edge._replace(
         done=jnp.where(is_proven, place, edge.done),
@@ -108,7 +111,7 @@ def _advance_once(arm: Arm, qpos: Array, bounds: Bounds, resolution: float, edge
         sink=jnp.where(is_new[None], jnp.where(is_probing[None], way, fall) / share[None], edge.sink),
         num_tries=jnp.where(is_new, 0, edge.num_tries + 1),
         num_probes=edge.num_probes + is_probing.astype(jnp.int32),
-        is_blocked=jnp.where(is_probing, ~is_clear, ~is_proven & (edge.num_tries >= LAST_TRY)),
+        is_blocked=jnp.where(is_probing, ~is_clear, is_too_near | (~is_proven & (edge.num_tries >= LAST_TRY))),
     )
     stays = is_settled(edge)
     return jax.tree.map(lambda a, b: jnp.where(stays[None] if a.ndim > stays.ndim else stays, b, a), new, edge)
@@ -118,7 +121,8 @@ def _step(pairs: collision.Pairs, edge: Edge, bounds: Bounds, resolution: float)
     """Returns f32[], the share of the edge to the next sample."""
     wide = functools.partial(widened, batch=edge.done.ndim)
     gap, boldness = edge.sample.gap, jnp.asarray(BOLD)[jnp.minimum(edge.num_tries, LAST_TRY)][None]
-    by_levers = (boldness * gap + resolution) / jnp.maximum(bounds.rate, 1e-9)
+    extra = jnp.where(edge.num_tries == 0, resolution, 0.0)[None]
+    by_levers = (boldness * gap + extra) / jnp.maximum(bounds.rate, 1e-9)
     is_table, mover = wide(pairs.part == collision.TABLE), pairs.mover
     # The root of speed t + curve t^2 = reserve.
     reserve = jnp.where(is_table, 0.5, 1.0) * boldness * gap
@@ -133,9 +137,9 @@ def edge_is_free(arm: Arm, start: Array, end: Array, config: PlanningConfig) -> 
     """Returns bool[]: nothing touches and the table's clearance is kept all along the straight joint path.
 
     True is a proof: there is no resolution below which a contact may slip through. False may also mean that the arm
-    passes within `config.resolution` of something, where the proof is given up. Ellipsoids count as the capsules around
-    them (see `collision.build_pairs`). For more than a few edges at once `rrt_connect` is faster, since its edges do
-    not wait for the slowest.
+    comes within `config.resolution` of something and nearer, where the proof is given up; it may start and end there.
+    Ellipsoids count as the capsules around them (see `collision.build_pairs`). For more than a few edges at once
+    `rrt_connect` is faster, since its edges do not wait for the slowest.
 
     Args:
       arm: the arm.

@@ -19,6 +19,9 @@ from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, 
 SAMPLES_PER_STEP = 2
 # An edge that is blocked before this share of `config.step` adds no node.
 LEAST_PROGRESS = 0.05
+# Each random edge without progress makes the tree's next one shorter by this, down to a share of `config.step`: a tree
+# in a narrow place cannot grow by long ones.
+SHORTER, LEAST_STEP = 0.9, 0.03
 
 
 class Problem(NamedTuple):
@@ -37,6 +40,7 @@ class Trees(NamedTuple):
       nodes: f32[2, M + 1, J] rad or m; the last row takes what is not kept.
       parents: i32[2, M + 1].
       counts: i32[2], nodes of each tree.
+      failures: i32[2], random edges of each since the last one that got on.
       edge: Edge from node `origin` of tree `tree`.
       tree: i32[].
       origin: i32[].
@@ -49,6 +53,7 @@ class Trees(NamedTuple):
     nodes: Array
     parents: Array
     counts: Array
+    failures: Array
     edge: Edge
     tree: Array
     origin: Array
@@ -67,6 +72,7 @@ def empty(arm: Arm, config: PlanningConfig) -> Trees:
         nodes=jnp.zeros((2, config.num_nodes + 1, count)),
         parents=jnp.zeros((2, config.num_nodes + 1), jnp.int32),
         counts=jnp.zeros(2, jnp.int32),
+        failures=jnp.zeros(2, jnp.int32),
         edge=edge_between(arm, origin, origin),
         tree=zero,
         origin=zero,
@@ -81,9 +87,10 @@ def begin(arm: Arm, config: PlanningConfig, problem: Problem, trees: Trees, is_n
     """Plants start and goal where `is_new`; nodes of an earlier problem stay and are written over."""
     row = jnp.where(is_new, 0, config.num_nodes)
     nodes = trees.nodes.at[jnp.arange(2), row].set(jnp.stack([problem.start, problem.goal]))
-    first = edge_between(arm, problem.start, _toward(problem.start, _sample(arm, problem, 0), config))
+    first = edge_between(arm, problem.start, _toward(problem.start, _sample(arm, problem, 0), config.step))
     fresh = trees._replace(
         counts=jnp.ones(2, jnp.int32),
+        failures=jnp.zeros(2, jnp.int32),
         edge=first,
         tree=jnp.int32(0),
         origin=jnp.int32(0),
@@ -114,7 +121,10 @@ def step(arm: Arm, config: PlanningConfig, is_bidirectional: bool, problem: Prob
     is_found = trees.is_found | (is_ready & trees.is_connecting & is_whole(edge))
     iterations = trees.iterations + is_ready.astype(jnp.int32)
     is_spent = jnp.any(counts >= config.num_nodes) | (iterations >= config.max_iterations)
-    new = trees._replace(nodes=nodes, parents=parents, counts=counts)
+    is_random = is_ready & ~trees.is_connecting
+    failures = jnp.where(is_kept, 0, trees.failures[trees.tree] + 1)
+    failures = trees.failures.at[trees.tree].set(jnp.where(is_random, failures, trees.failures[trees.tree]))
+    new = trees._replace(nodes=nodes, parents=parents, counts=counts, failures=failures)
     tree, origin, target, is_connecting = _next(arm, config, is_bidirectional, problem, new, (edge, is_kept))
     following = edge_between(arm, nodes[tree, origin], target)
     return new._replace(
@@ -145,7 +155,8 @@ def _next(
     squared = jnp.sum((trees.nodes[tree] - query[None]) ** 2, axis=-1)
     origin = jnp.argmin(jnp.where(jnp.arange(squared.shape[0]) < trees.counts[tree], squared, jnp.inf))
     origin = origin.astype(jnp.int32)
-    target = jnp.where(is_connecting, query, _toward(trees.nodes[tree, origin], query, config))
+    length = config.step * jnp.maximum(SHORTER ** trees.failures[tree].astype(jnp.float32), LEAST_STEP)
+    target = jnp.where(is_connecting, query, _toward(trees.nodes[tree, origin], query, length))
     return tree, origin, target, is_connecting
 
 
@@ -156,10 +167,10 @@ def _sample(arm: Arm, problem: Problem, index: int | Array) -> Array:
     return lower + share * (upper - lower)
 
 
-def _toward(origin: Array, target: Array, config: PlanningConfig) -> Array:
+def _toward(origin: Array, target: Array, step: Array | float) -> Array:
     change = target - origin
     length = jnp.sqrt(jnp.maximum(jnp.sum(change * change), 1e-12))
-    return origin + change * jnp.minimum(1.0, config.step / length)
+    return origin + change * jnp.minimum(1.0, step / length)
 
 
 def waypoints(config: PlanningConfig, trees: Trees) -> tuple[Array, Array]:
