@@ -62,7 +62,7 @@ class PlanningConfig:
 
     num_nodes: int = 512
     """Nodes of a tree, at most."""
-    max_iterations: int = 2048
+    max_iterations: int = 4096
     """Edges that are tried for one problem, at most."""
     step: float = 3.0
     """Length in rad of a tree's random edges."""

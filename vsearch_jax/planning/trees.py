@@ -19,9 +19,6 @@ from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, 
 SAMPLES_PER_STEP = 2
 # An edge that is blocked before this share of `config.step` adds no node.
 LEAST_PROGRESS = 0.05
-# Each random edge without progress makes the tree's next one shorter by this, down to a share of `config.step`: a tree
-# in a narrow place cannot grow by long ones.
-SHORTER, LEAST_STEP = 0.9, 0.03
 
 
 class Problem(NamedTuple):
@@ -40,7 +37,6 @@ class Trees(NamedTuple):
       nodes: f32[2, M + 1, J] rad or m; the last row takes what is not kept.
       parents: i32[2, M + 1].
       counts: i32[2], nodes of each tree.
-      failures: i32[2], random edges of each since the last one that got on.
       edge: Edge from node `origin` of tree `tree`.
       tree: i32[].
       origin: i32[].
@@ -53,7 +49,6 @@ class Trees(NamedTuple):
     nodes: Array
     parents: Array
     counts: Array
-    failures: Array
     edge: Edge
     tree: Array
     origin: Array
@@ -72,7 +67,6 @@ def empty(arm: Arm, config: PlanningConfig) -> Trees:
         nodes=jnp.zeros((2, config.num_nodes + 1, count)),
         parents=jnp.zeros((2, config.num_nodes + 1), jnp.int32),
         counts=jnp.zeros(2, jnp.int32),
-        failures=jnp.zeros(2, jnp.int32),
         edge=edge_between(arm, origin, origin),
         tree=zero,
         origin=zero,
@@ -90,7 +84,6 @@ def begin(arm: Arm, config: PlanningConfig, problem: Problem, trees: Trees, is_n
     first = edge_between(arm, problem.start, _toward(problem.start, _sample(arm, problem, 0), config.step))
     fresh = trees._replace(
         counts=jnp.ones(2, jnp.int32),
-        failures=jnp.zeros(2, jnp.int32),
         edge=first,
         tree=jnp.int32(0),
         origin=jnp.int32(0),
@@ -121,10 +114,7 @@ def step(arm: Arm, config: PlanningConfig, is_bidirectional: bool, problem: Prob
     is_found = trees.is_found | (is_ready & trees.is_connecting & is_whole(edge))
     iterations = trees.iterations + is_ready.astype(jnp.int32)
     is_spent = jnp.any(counts >= config.num_nodes) | (iterations >= config.max_iterations)
-    is_random = is_ready & ~trees.is_connecting
-    failures = jnp.where(is_kept, 0, trees.failures[trees.tree] + 1)
-    failures = trees.failures.at[trees.tree].set(jnp.where(is_random, failures, trees.failures[trees.tree]))
-    new = trees._replace(nodes=nodes, parents=parents, counts=counts, failures=failures)
+    new = trees._replace(nodes=nodes, parents=parents, counts=counts)
     tree, origin, target, is_connecting = _next(arm, config, is_bidirectional, problem, new, (edge, is_kept))
     following = edge_between(arm, nodes[tree, origin], target)
     return new._replace(
@@ -155,8 +145,7 @@ def _next(
     squared = jnp.sum((trees.nodes[tree] - query[None]) ** 2, axis=-1)
     origin = jnp.argmin(jnp.where(jnp.arange(squared.shape[0]) < trees.counts[tree], squared, jnp.inf))
     origin = origin.astype(jnp.int32)
-    length = config.step * jnp.maximum(SHORTER ** trees.failures[tree].astype(jnp.float32), LEAST_STEP)
-    target = jnp.where(is_connecting, query, _toward(trees.nodes[tree, origin], query, length))
+    target = jnp.where(is_connecting, query, _toward(trees.nodes[tree, origin], query, config.step))
     return tree, origin, target, is_connecting
 
 
