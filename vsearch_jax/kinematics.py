@@ -67,6 +67,11 @@ def rotate(rotation: Array, vector: Array) -> Array:
     return jnp.sum(rotation * vector[..., None, :], axis=-1)
 
 
+def rotate_each(rotations: Array, vectors: Array) -> Array:
+    """Returns f32[N, 3, ...], `vectors` (f32[N, 3, ...]) turned by `rotations` (f32[N, 3, 3, ...]); see `frames`."""
+    return jnp.sum(rotations * vectors[:, None], axis=2)
+
+
 def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
     """Returns rotations f32[J + 1, 3, 3] and origins f32[J + 1, 3] of world and joints, axes and anchors f32[J, 3].
 
@@ -81,7 +86,7 @@ def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
     change = values - wide(joints.reference)
     angle, offset = jnp.where(is_slide, 0.0, change), jnp.where(is_slide, change, 0.0)
     # In the frames of the parents, all at once; what is left for the scan is to chain them.
-    shift = jnp.sum(rotation * axis[:, None], axis=2) * offset[:, None]
+    shift = rotate_each(rotation, axis) * offset[:, None]
     turned = jnp.sum(rotation[:, :, :, None] * _axis_rotations(axis, angle)[:, None], axis=2)
     start = (
         jnp.broadcast_to(wide(jnp.eye(3)), (count + 1, *turned.shape[1:])),
@@ -89,7 +94,7 @@ def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
     )
     steps = (joints.parent, turned, wide(joints.position) + shift, jnp.arange(1, count + 1))
     (rotations, positions), _ = jax.lax.scan(_next_frame, start, steps)
-    axes = jnp.sum(rotations[1:] * axis[:, None], axis=2)
+    axes = rotate_each(rotations[1:], axis)
     return rotations, positions, axes, positions[1:] - axes * offset[:, None]
 
 

@@ -28,7 +28,8 @@ class Job(NamedTuple):
       step: (problem, state) -> state; a state that is done must come back unchanged.
       is_done: state -> bool[].
       finish: (problem, state) -> result.
-      has_stragglers: some problems take many more steps than others. Then the last go on alone, compiled apart.
+      has_stragglers: some problems take many more steps than others. Then the last few go on alone, which
+        is compiled apart and so takes longer to compile.
     """
 
     begin: Callable[[Any, Any, Array], Any]

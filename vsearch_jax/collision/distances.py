@@ -17,6 +17,7 @@ from jax import Array
 from vsearch_jax import shapes
 from vsearch_jax.batches import widened
 from vsearch_jax.collision.pairs import Pairs, Solids
+from vsearch_jax.kinematics import rotate_each
 from vsearch_jax.shapes import Vector
 
 
@@ -47,12 +48,10 @@ def gaps(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) 
 def axes_from_frames(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
     """Returns the axes of the capsules from the frames of the joints; see `kinematics.frames`, also for batches."""
     frame = pairs.placement.frame
-    rotation, position = rotations[frame], positions[frame]
-
-    def turned(vectors: Array) -> Array:
-        return jnp.sum(rotation * widened(vectors, position.ndim - 2)[:, None], axis=2)
-
-    center, half_axis = position + turned(pairs.placement.position), turned(pairs.frame_half_axis)
+    wide = functools.partial(widened, batch=positions.ndim - 2)
+    rotation = rotations[frame]
+    center = positions[frame] + rotate_each(rotation, wide(pairs.placement.position))
+    half_axis = rotate_each(rotation, wide(pairs.frame_half_axis))
     return Axes((center[:, 0], center[:, 1], center[:, 2]), (half_axis[:, 0], half_axis[:, 1], half_axis[:, 2]))
 
 

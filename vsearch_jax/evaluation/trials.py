@@ -87,9 +87,7 @@ def _trial(
     states = tuple(method.start(args, score) for method in methods)
     body = functools.partial(_generation, env, methods, (number, key), target, args)
 
-    def goes_on(trial: _Trial) -> Array:
-        return _goes_on(methods, number, args, trial)
-
+    goes_on = functools.partial(_goes_on, methods, number, args)
     return jax.lax.while_loop(goes_on, body, _Trial(states, start.camera, start.qpos, jnp.zeros(2)))
 
 

@@ -6,7 +6,6 @@ of each joint's acceleration kept for the bends, so that both passes are running
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -149,7 +148,7 @@ def _at(arm: Arm, trajectory: Trajectory, piece: Array, place: Array) -> tuple[A
 
 def _bend_radii(arm: Arm, waypoints: Array, unit: Array, lengths: Array) -> Array:
     """Returns f32[W]: how far in rad before and after each waypoint its bend begins and ends; 0 at both ends."""
-    gap = jax.vmap(functools.partial(look, arm))(waypoints[1:-1]).gap
+    gap = look(arm, waypoints[1:-1].T).gap.T
     rate = jnp.sum(arm.planning_pairs.levers[None] * jnp.abs(unit)[:, None], axis=-1)
     room = gap / jnp.maximum(jnp.maximum(rate[:-1], rate[1:]), 1e-9)
     free = FREE_SHARE * jnp.min(room, axis=-1, initial=jnp.inf)

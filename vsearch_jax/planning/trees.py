@@ -81,7 +81,7 @@ def begin(arm: Arm, config: PlanningConfig, problem: Problem, trees: Trees, is_n
     """Plants start and goal where `is_new`; nodes of an earlier problem stay and are written over."""
     row = jnp.where(is_new, 0, config.num_nodes)
     nodes = trees.nodes.at[jnp.arange(2), row].set(jnp.stack([problem.start, problem.goal]))
-    first = edge_between(arm, problem.start, _toward(problem.start, _sample(arm, problem, 0), config.step))
+    first = edge_between(arm, problem.start, _toward(problem.start, _sample(arm, problem, 0), config))
     fresh = trees._replace(
         counts=jnp.ones(2, jnp.int32),
         edge=first,
@@ -145,7 +145,7 @@ def _next(
     squared = jnp.sum((trees.nodes[tree] - query[None]) ** 2, axis=-1)
     origin = jnp.argmin(jnp.where(jnp.arange(squared.shape[0]) < trees.counts[tree], squared, jnp.inf))
     origin = origin.astype(jnp.int32)
-    target = jnp.where(is_connecting, query, _toward(trees.nodes[tree, origin], query, config.step))
+    target = jnp.where(is_connecting, query, _toward(trees.nodes[tree, origin], query, config))
     return tree, origin, target, is_connecting
 
 
@@ -156,10 +156,10 @@ def _sample(arm: Arm, problem: Problem, index: int | Array) -> Array:
     return lower + share * (upper - lower)
 
 
-def _toward(origin: Array, target: Array, step: Array | float) -> Array:
+def _toward(origin: Array, target: Array, config: PlanningConfig) -> Array:
     change = target - origin
     length = jnp.sqrt(jnp.maximum(jnp.sum(change * change), 1e-12))
-    return origin + change * jnp.minimum(1.0, step / length)
+    return origin + change * jnp.minimum(1.0, config.step / length)
 
 
 def waypoints(config: PlanningConfig, trees: Trees) -> tuple[Array, Array]:
