@@ -2,7 +2,7 @@
 
 import sys
 
-from vsearch_jax.cli import main
+from vsearch_jax.cli.main import main
 
 if __name__ == "__main__":
     main(["eval", *sys.argv[1:]])

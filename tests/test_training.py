@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import vsearch_jax as vs
-from vsearch_jax import checkpoint, training
+from vsearch_jax import training
+from vsearch_jax.runs import checkpoint
 
 CONFIG = vs.Config.preset("smoke")
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vsearch_jax import planning, render, search
-    from vsearch_jax.arm import build_arm
     from vsearch_jax.config import Config
     from vsearch_jax.env import ViewSearchEnv
     from vsearch_jax.evaluation import evaluate
+    from vsearch_jax.robot.arm import build_arm
     from vsearch_jax.scene import build_scene
     from vsearch_jax.training import init, train
 
@@ -33,7 +33,7 @@ __all__ = [
 _HOMES = {
     "Config": "config",
     "ViewSearchEnv": "env",
-    "build_arm": "arm",
+    "build_arm": "robot.arm",
     "build_scene": "scene",
     "evaluate": "evaluation",
     "init": "training",

@@ -13,6 +13,19 @@ from vsearch_jax.geometry import frobenius_angle, rotation_error
 from vsearch_jax.types import Camera, EpisodeState, ReachabilityMap
 
 
+class UnreachableError(ConfigError):
+    """The arm does not reach the views that are wanted.
+
+    Attributes:
+      reach: the arm's reachability map.
+    """
+
+    def __init__(self, message: str, reach: ReachabilityMap) -> None:
+        """Keeps the map beside the message."""
+        super().__init__(message)
+        self.reach = reach
+
+
 def check_band(reach: ReachabilityMap, config: Config) -> None:
     """Checks that there is a band to search; does nothing under a trace.
 
@@ -20,10 +33,11 @@ def check_band(reach: ReachabilityMap, config: Config) -> None:
       ConfigError: the arm reaches no elevation at every azimuth.
     """
     if not isinstance(reach.band, Tracer) and np.isnan(reach.band).any():
-        raise ConfigError(
+        raise UnreachableError(
             f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
             f"at every azimuth around object {config.scene.object!r}; `vsearch reach` draws what it does reach, and "
-            "proposes a mount_height"
+            "proposes a mount_height",
+            reach,
         )
 
 

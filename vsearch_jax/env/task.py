@@ -12,10 +12,8 @@ from jax import Array
 
 from vsearch_jax import encoder as encoders
 from vsearch_jax import render
-from vsearch_jax.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.config import Config
 from vsearch_jax.env.episode import check_band, episode_of, observe
-from vsearch_jax.execution import check_drive, execute
 from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.planning import (
     Motion,
@@ -28,6 +26,8 @@ from vsearch_jax.planning import (
     straight_duration,
     time_path,
 )
+from vsearch_jax.planning.execution import check_drive, execute
+from vsearch_jax.robot.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.scene import SceneError, build_scene
 from vsearch_jax.types import (
     Camera,

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.bound import steps_lower_bound
 from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv, episode_of
 from vsearch_jax.evaluation.outcome import outcome
+from vsearch_jax.evaluation.step_bound import steps_lower_bound
 from vsearch_jax.search import SearchArgs, sac
 from vsearch_jax.types import Sight, TrainState
 

@@ -10,17 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from vsearch_jax.batches import map_batched
-from vsearch_jax.bound import band_grid
-from vsearch_jax.config import Config, ConfigError
-from vsearch_jax.env import ViewSearchEnv, check_band
+from vsearch_jax.config import Config
+from vsearch_jax.env import UnreachableError, ViewSearchEnv, check_band
 from vsearch_jax.evaluation.episodes import episode_keys, evaluate_policies
 from vsearch_jax.evaluation.outcome import outcome
+from vsearch_jax.evaluation.step_bound import band_grid
 from vsearch_jax.evaluation.trials import search_trials
 from vsearch_jax.evaluation.views import Asked, initial_views, look_at, protocol_target
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.search import cma_es, random_search
 from vsearch_jax.types import ReachabilityMap, Sight, TrainState
+from vsearch_jax.xla.batching import map_batched
 
 
 def evaluate(state: TrainState, config: Config) -> dict[str, Any]:
@@ -57,9 +57,10 @@ def check_target(reach: ReachabilityMap, config: Config) -> None:
     low, high = np.rad2deg(np.asarray(reach.band))
     elevation = config.evaluation.target_elevation_deg
     if not low - 1e-3 <= elevation <= high + 1e-3:
-        raise ConfigError(
+        raise UnreachableError(
             f"EvaluationConfig.target_elevation_deg is {elevation:g}, which the arm cannot reach at every azimuth; "
-            f"allowed with this arm, mount and object: {low:.1f} to {high:.1f}"
+            f"allowed with this arm, mount and object: {low:.1f} to {high:.1f}",
+            reach,
         )
 
 

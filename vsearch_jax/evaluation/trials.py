@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.batches import map_batched
 from vsearch_jax.env import ViewSearchEnv
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
 from vsearch_jax.search.common import is_running, taken, to_result
 from vsearch_jax.types import Camera, SearchResult, Sight, View
+from vsearch_jax.xla.batching import map_batched
 
 
 class _Trial(NamedTuple):

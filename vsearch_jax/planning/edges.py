@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax import collision
-from vsearch_jax.arm import Arm
-from vsearch_jax.batches import batch_last, widened
-from vsearch_jax.collision import Axes
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.proofs import Bounds, Sample, is_free_between, look, motion_bounds, ways
+from vsearch_jax.robot import collision
+from vsearch_jax.robot.arm import Arm
+from vsearch_jax.robot.collision import Axes
+from vsearch_jax.xla.batching import batch_last, widened
 
 # A step is as long as if the next sample were nearly as far from everything as this one, and the speed the same. Where
 # that fails, a shorter one is tried, then one that is safe wherever the next sample touches nothing.

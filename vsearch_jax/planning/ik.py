@@ -11,13 +11,13 @@ import numpy as np
 from jax import Array
 from jaxlie import SE3
 
-from vsearch_jax import lanes
-from vsearch_jax.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.config import IKConfig
 from vsearch_jax.planning import levenberg
 from vsearch_jax.planning.levenberg import Goal, Iterate
 from vsearch_jax.planning.starts import finite_joints, judge
+from vsearch_jax.robot.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.types import IKResult
+from vsearch_jax.xla import lane_pool
 
 # Lanes of a batch: enough for the vector units, few enough for the cache.
 MOST_LANES = 256
@@ -78,8 +78,8 @@ def ik(arm: Arm, T_world_camera: SE3, qpos: Array, config: IKConfig) -> IKResult
     contact gives way to one without, if the next starts find one. Without any solution the closest try is returned.
     Joints that do not move the camera (fingers, loose parts) stay.
 
-    Under `vmap` the problems share a fixed number of lanes (see `vsearch_jax.lanes`), so that none waits for the
-    slowest; the arm cannot be mapped over.
+    Under `vmap` the problems share a fixed number of lanes (see `xla.lane_pool`), so that none waits for the slowest;
+    the arm cannot be mapped over.
 
     Args:
       arm: the arm.
@@ -88,7 +88,7 @@ def ik(arm: Arm, T_world_camera: SE3, qpos: Array, config: IKConfig) -> IKResult
         limits, but the status says so and the result does not count as converged.
       config: iterations, damping, tolerances, number of starts, and whether the camera may roll.
     """
-    solve = lanes.flattened(functools.partial(_solve_batch, config))
+    solve = lane_pool.flattened(functools.partial(_solve_batch, config))
     poses = (T_world_camera.translation()[None], T_world_camera.rotation().as_matrix()[None])
     result = solve(arm, (*poses, qpos[None]))
     return jax.tree.map(lambda leaf: leaf[0], result)
@@ -127,7 +127,7 @@ def _clear(arm: Arm, joints: Array, finite: Array, is_open: Array) -> Array:
         free = is_free(arm, forward_kinematics(arm, whole.at[arm.chain.address].set(chain)))
         return jnp.where(free, 1, 0)
 
-    job = lanes.Job(
+    job = lane_pool.Job(
         begin=lambda _, state, is_new: jnp.where(is_new, -1, state),
         step=step,
         is_done=lambda state: state >= 0,
@@ -135,11 +135,11 @@ def _clear(arm: Arm, joints: Array, finite: Array, is_open: Array) -> Array:
         has_stragglers=False,
     )
     blank, states = jnp.zeros(is_open.shape, bool), jnp.zeros(min(MOST_LANES, is_open.shape[0]), jnp.int32)
-    return lanes.run(job, (joints, finite), lanes.in_order(is_open), states, blank)
+    return lane_pool.run(job, (joints, finite), lane_pool.in_order(is_open), states, blank)
 
 
 def _run(arm: Arm, config: IKConfig, problems: _Problem, is_open: Array, results: _Solution) -> _Solution:
-    job = lanes.Job(
+    job = lane_pool.Job(
         functools.partial(_begin, config),
         functools.partial(_step, arm, config),
         lambda state: state.is_done,
@@ -148,7 +148,7 @@ def _run(arm: Arm, config: IKConfig, problems: _Problem, is_open: Array, results
     num_lanes = min(MOST_LANES, is_open.shape[0])
     first = jax.tree.map(lambda leaf: leaf[:num_lanes], problems)
     states = jax.vmap(functools.partial(_fresh, config))(first)
-    return lanes.run(job, problems, lanes.in_order(is_open), states, results)
+    return lane_pool.run(job, problems, lane_pool.in_order(is_open), states, results)
 
 
 def _fresh(config: IKConfig, problem: _Problem) -> _State:

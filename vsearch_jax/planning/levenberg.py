@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxlie import SE3, SO3
 
-from vsearch_jax.arm import Arm, camera_kinematics
 from vsearch_jax.config import IKConfig
+from vsearch_jax.robot.arm import Arm, camera_kinematics
 
 # Metres that one radian weighs in the cost: about the lever of a wrist.
 ROTATION_WEIGHT = 0.3

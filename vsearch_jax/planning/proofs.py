@@ -21,11 +21,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax import collision, kinematics, shapes
-from vsearch_jax.arm import Arm
-from vsearch_jax.batches import widened
-from vsearch_jax.boundary import materialize, unknown_zero
-from vsearch_jax.collision import Axes, Pairs
+from vsearch_jax.robot import collision, kinematics
+from vsearch_jax.robot.arm import Arm
+from vsearch_jax.robot.collision import Axes, Pairs, primitives
+from vsearch_jax.xla.batching import widened
+from vsearch_jax.xla.materialize import materialize, unknown_zero
 
 # m, of positions in float32.
 ROUNDING = 1e-5
@@ -79,10 +79,10 @@ def motion_bounds(pairs: Pairs, change: Array) -> Bounds:
 
 def ways(before: Axes, after: Axes) -> tuple[Array, Array]:
     """Returns how far in m the capsules have moved, f32[C], and how far downward, f32[C]."""
-    middle, end = shapes.minus(after.center, before.center), shapes.minus(after.half_axis, before.half_axis)
+    middle, end = primitives.minus(after.center, before.center), primitives.minus(after.half_axis, before.half_axis)
     one = jnp.ones_like(middle[0])
-    moves = [shapes.along(middle, sign * one, end) for sign in (1.0, -1.0)]
-    way = jnp.maximum(*(shapes.norm(move) for move in moves))
+    moves = [primitives.along(middle, sign * one, end) for sign in (1.0, -1.0)]
+    way = jnp.maximum(*(primitives.norm(move) for move in moves))
     return way, jnp.maximum(-jnp.minimum(*(move[2] for move in moves)), 0.0)
 
 

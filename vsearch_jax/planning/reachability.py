@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxlie import SE3
 
-from vsearch_jax.arm import Arm
 from vsearch_jax.config import IKConfig
 from vsearch_jax.geometry import view_pose, wrap_angle
 from vsearch_jax.planning.starts import ik_from_starts, rank, solve_starts, start_limits
+from vsearch_jax.robot.arm import Arm
 from vsearch_jax.types import IKResult, ReachabilityMap, View
 
 # Every round solves each cell from new random starts, from its own joints and from those of its four neighbours.

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax import lanes
-from vsearch_jax.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning import shortcuts, trees
 from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, is_whole
 from vsearch_jax.planning.shortcuts import Crooked
 from vsearch_jax.planning.trees import Problem
+from vsearch_jax.robot.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.types import Path, PlanStatus
+from vsearch_jax.xla import lane_pool
 
 # Lanes of a batch: more cost less each, but more of them idle at the end.
 MOST_LANES = 64
@@ -28,8 +28,8 @@ def rrt_connect(arm: Arm, key: Array, start: Array, goal: Array, config: Plannin
     The straight joint path comes first; two trees that grow towards one another where it is blocked; shortcuts shorten
     what they find. That the path is free is proven (see `edges`), under the model's own geometry.
 
-    Under `vmap` the problems share a fixed number of lanes (see `vsearch_jax.lanes`), so that none waits for the
-    slowest; the arm cannot be mapped over.
+    Under `vmap` the problems share a fixed number of lanes (see `xla.lane_pool`), so that none waits for the slowest;
+    the arm cannot be mapped over.
 
     Args:
       arm: the arm.
@@ -51,7 +51,7 @@ def rrt(arm: Arm, key: Array, start: Array, goal: Array, config: PlanningConfig)
 
 
 def _plan(is_bidirectional: bool, arm: Arm, key: Array, start: Array, goal: Array, config: PlanningConfig) -> Path:
-    plan = lanes.flattened(functools.partial(_plan_batch, is_bidirectional, config))
+    plan = lane_pool.flattened(functools.partial(_plan_batch, is_bidirectional, config))
     result = plan(arm, (key[None], start[None], goal[None]))
     return jax.tree.map(lambda leaf: leaf[0], result)
 
@@ -100,7 +100,7 @@ def _straight(arm: Arm, config: PlanningConfig, problems: Problem, is_open: Arra
         fresh = edge_between(arm, problem.start, problem.goal)
         return jax.tree.map(lambda a, b: jnp.where(is_new, a, b), fresh, edge)
 
-    job = lanes.Job(
+    job = lane_pool.Job(
         begin,
         lambda problem, edge: advance(arm, edge, problem.qpos, config),
         is_settled,
@@ -109,7 +109,7 @@ def _straight(arm: Arm, config: PlanningConfig, problems: Problem, is_open: Arra
     )
     origin = jnp.zeros(problems.start.shape[1])
     states = _copies(edge_between(arm, origin, origin), is_open)
-    return lanes.run(job, problems, lanes.in_order(is_open), states, jnp.zeros(is_open.shape[0], bool))
+    return lane_pool.run(job, problems, lane_pool.in_order(is_open), states, jnp.zeros(is_open.shape[0], bool))
 
 
 def _grow(
@@ -121,17 +121,17 @@ def _grow(
         waypoints, count = trees.waypoints(config, state)
         return waypoints, count, state.is_found & (count <= config.max_waypoints)
 
-    job = lanes.Job(
+    job = lane_pool.Job(
         functools.partial(trees.begin, arm, config),
         functools.partial(trees.step, arm, config, is_bidirectional),
         lambda state: state.is_done,
         finish,
     )
-    return lanes.run(job, problems, lanes.in_order(is_open), _copies(trees.empty(arm, config), is_open), blank)
+    return lane_pool.run(job, problems, lane_pool.in_order(is_open), _copies(trees.empty(arm, config), is_open), blank)
 
 
 def _shorten(arm: Arm, config: PlanningConfig, paths: Crooked, is_open: Array) -> Array:
-    job = lanes.Job(
+    job = lane_pool.Job(
         functools.partial(shortcuts.begin, arm),
         functools.partial(shortcuts.step, arm, config),
         functools.partial(shortcuts.is_done, config),
@@ -139,7 +139,7 @@ def _shorten(arm: Arm, config: PlanningConfig, paths: Crooked, is_open: Array) -
         has_stragglers=False,
     )
     states = _copies(shortcuts.empty(arm, config), is_open)
-    return lanes.run(job, paths, lanes.in_order(is_open), states, paths.waypoints)
+    return lane_pool.run(job, paths, lane_pool.in_order(is_open), states, paths.waypoints)
 
 
 def _copies(state: Any, problems: Array) -> Any:

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.arm import Arm
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, is_whole
+from vsearch_jax.robot.arm import Arm
 
 SAMPLES_PER_STEP = 2
 # A shortcut must save this share of the path, else it is not worth its samples.

@@ -10,10 +10,10 @@ from jax import Array
 from jaxlie import SE3
 from mujoco import mjx
 
-from vsearch_jax.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.config import IKConfig
 from vsearch_jax.planning import levenberg
 from vsearch_jax.planning.levenberg import Goal, goal_of
+from vsearch_jax.robot.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.types import IKResult, IKStatus
 
 

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.arm import Arm
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.proofs import look
+from vsearch_jax.robot.arm import Arm
 from vsearch_jax.types import Path, Trajectory
 
 # Intervals of the grid on each straight piece and on each bend.

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.arm import Arm
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, is_whole, reached
+from vsearch_jax.robot.arm import Arm
 
 # Samples of an edge between two looks at the trees, which cost about half as much as one sample.
 SAMPLES_PER_STEP = 2

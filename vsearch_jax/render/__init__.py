@@ -1,9 +1,9 @@
 """A batched ray-caster for MuJoCo models in plain JAX: colour with cast shadows, depth, normals and geom numbers."""
 
-from vsearch_jax.render.camera import camera, camera_from_matrix, camera_from_pose
+from vsearch_jax.render.cameras import camera, camera_from_matrix, camera_from_pose
 from vsearch_jax.render.image import render, render_batch, silhouette, supersample
+from vsearch_jax.render.mj_poses import Poses, poses
 from vsearch_jax.render.outline import Square, crop, soft_silhouette, square_around
-from vsearch_jax.render.poses import Poses, poses
 from vsearch_jax.render.scene import Lights, RenderError, RenderScene, compile_scene
 
 __all__ = [

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from vsearch_jax.batches import map_batched
-from vsearch_jax.boundary import materialize, unknown_zero
-from vsearch_jax.render import shading, texturing, trace
-from vsearch_jax.render.camera import magnified, pinhole, pixel_rays
-from vsearch_jax.render.lighting import (
+from vsearch_jax.render import trace
+from vsearch_jax.render.cameras import magnified, pinhole, pixel_rays
+from vsearch_jax.render.geometry.rasterizer import Pinhole, Raster, View, rasterize
+from vsearch_jax.render.light import shading
+from vsearch_jax.render.light.lighting import (
     LightPoses,
     incidences,
     light_poses,
@@ -22,12 +22,14 @@ from vsearch_jax.render.lighting import (
     needs_shadow_maps,
     shadow_maps,
 )
+from vsearch_jax.render.light.shadow_map import ShadowMap
 from vsearch_jax.render.pixels import surface_of
-from vsearch_jax.render.raster import Pinhole, Raster, View, rasterize
 from vsearch_jax.render.scene import RenderError, RenderScene
-from vsearch_jax.render.shadow_map import ShadowMap
+from vsearch_jax.render.texture import lookup
 from vsearch_jax.render.tiling import Tiling
 from vsearch_jax.types import Camera, Image
+from vsearch_jax.xla.batching import map_batched
+from vsearch_jax.xla.materialize import materialize, unknown_zero
 
 # Height and width of the part of an image that is drawn at a time on a CPU: the some forty planes of a batch of such
 # parts stay in its cache, and a part meets fewer geoms than the whole.
@@ -146,7 +148,7 @@ def _render_tile(scene: RenderScene, sight: _Sight, tile: _Tile) -> Image:
     channels = shading.shade(scene, surface, materialize(incidences(scene, sight.lights, surface, rays, lit), zero))
     behind = (scene.background[0], scene.background[1], scene.background[2])
     if scene.textures is not None and scene.textures.sky is not None:
-        behind = texturing.sky(scene.textures, trace.apply(sight.rotation, (*rays, -jnp.ones_like(rays[0]))))
+        behind = lookup.sky(scene.textures, trace.apply(sight.rotation, (*rays, -jnp.ones_like(rays[0]))))
     rgb = [jnp.where(hits.is_hit, channel, b) for channel, b in zip(channels, behind, strict=True)]
     geom_ids = jnp.asarray(scene.geom_ids, dtype=jnp.int32).at[hits.slot].get(mode="promise_in_bounds")
     return Image(

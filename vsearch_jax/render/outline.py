@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from vsearch_jax.render.camera import pinhole, pixel_rays
+from vsearch_jax.render.cameras import pinhole, pixel_rays
 from vsearch_jax.render.image import render, silhouette
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.types import Camera

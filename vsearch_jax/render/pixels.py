@@ -7,12 +7,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxlie import SO3
 
-from vsearch_jax.boundary import materialize
-from vsearch_jax.render import texturing, trace
-from vsearch_jax.render.rays import Vector, dot
+from vsearch_jax.render import trace
+from vsearch_jax.render.geometry.level_sets import affine, level, select
+from vsearch_jax.render.geometry.rays import Vector, dot
+from vsearch_jax.render.light.shading import Surface
 from vsearch_jax.render.scene import RenderScene
-from vsearch_jax.render.shading import Surface
-from vsearch_jax.render.surface import affine, level, select
+from vsearch_jax.render.texture import lookup
+from vsearch_jax.xla.materialize import materialize
 
 
 def look_up(table: Array | list[Array], index: Array) -> list[Array]:
@@ -89,7 +90,7 @@ def surface_of(
             u, v = affine(faces[16:24], local)
             texcoord = (u, v)
         local = materialize(local, zero)
-        tint = texturing.colour(scene.textures, hits.slot, starts, (size, local), texcoord)
+        tint = lookup.colour(scene.textures, hits.slot, starts, (size, local), texcoord)
         tint = materialize(tint, zero)
     return depth, Surface(point, normal, flat, rgb, rows[13], rows[14], rows[15], tint)
 

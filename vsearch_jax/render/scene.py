@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array
 from mujoco import mjtGeom, mjtLightType, mjtObj, mjtTexture
 
-from vsearch_jax.render.rays import RAY_FUNCTIONS
-from vsearch_jax.render.textures import Textures, compile_textures, rgb_texture
-from vsearch_jax.render.triangles import TRIANGLE_TYPES, Triangles, compile_triangles
+from vsearch_jax.render.geometry.rays import RAY_FUNCTIONS
+from vsearch_jax.render.geometry.triangles import TRIANGLE_TYPES, Triangles, compile_triangles
+from vsearch_jax.render.texture.atlas import Textures, compile_textures, rgb_texture
 
 # What MuJoCo's renderer assumes of a geom without a material (mjv_initGeom) ...
 _DEFAULT_SPECULAR, _DEFAULT_SHININESS = 0.5, 0.5

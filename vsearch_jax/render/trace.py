@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jax import Array
 from mujoco import mjtGeom
 
-from vsearch_jax.render.raster import Raster
-from vsearch_jax.render.rays import CHORD_FUNCTIONS, RAY_FUNCTIONS, Vector, dot
+from vsearch_jax.render.geometry.rasterizer import Raster
+from vsearch_jax.render.geometry.rays import CHORD_FUNCTIONS, RAY_FUNCTIONS, Vector, dot
 from vsearch_jax.render.scene import RenderScene
 
 _INFINITY_BITS = 0x7F800000

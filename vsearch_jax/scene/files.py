@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from vsearch_jax.config import SceneConfig
-from vsearch_jax.meshes import MESH_SUFFIXES, MeshError, check, is_read_by_mujoco, read_mesh
+from vsearch_jax.scene.meshes import MESH_SUFFIXES, MeshError, check, is_read_by_mujoco, read_mesh
 
 TCP_SITE = "tcp"
 WRIST_CAMERA = "wrist"

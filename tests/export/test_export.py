@@ -1,0 +1,105 @@
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from samples import made_up
+from vsearch_jax import encoder as encoders
+from vsearch_jax.config import Config, ConfigError
+from vsearch_jax.export.stablehlo import export
+from vsearch_jax.search import sac
+from vsearch_jax.types import Image
+
+NUM_JOINTS = 9
+
+
+def configured(kind: str) -> Config:
+    config = Config.preset("smoke")
+    encoder = dataclasses.replace(config.encoder, input=kind)
+    return dataclasses.replace(config, encoder=encoder, sac=dataclasses.replace(config.sac, num_seeds=2))
+
+
+def trained(config: Config) -> Any:
+    """The parts of a TrainState that an export reads, at random."""
+    observation_size = 2 * config.encoder.code_size + NUM_JOINTS
+    keys = jax.random.split(jax.random.key(1), config.sac.num_seeds)
+    encoder = encoders.init(jax.random.key(0), config)
+    return SimpleNamespace(
+        encoder=encoder.replace(latent_mean=0.1 * jax.random.normal(keys[0], encoder.latent_mean.shape)),
+        sac=jax.vmap(lambda key: sac.init(key, config.sac, observation_size, 2))(keys),
+        pool=SimpleNamespace(qpos=jnp.zeros((5, NUM_JOINTS)), camera=SimpleNamespace(fovy=jnp.full(5, 0.5))),
+        reach=made_up.reach(),
+    )
+
+
+def pictures(kind: str, count: int, size: int) -> tuple[np.ndarray, Image]:
+    """Pictures as a camera gives them, and the same as the renderer does."""
+    random = np.random.default_rng(0)
+    rgb = random.integers(0, 256, (count, size, size, 3), dtype=np.uint8)
+    depth = random.uniform(0.1, 0.6, (count, size, size)).astype(np.float32)
+    depth[:, 0] = np.inf
+    mask = random.integers(0, 2, (count, size, size), dtype=np.uint8)
+    image = Image(rgb=rgb.astype(np.float32) / 255, depth=depth, geom_id=np.where(mask > 0, 7, -1))
+    return {"rgb": rgb, "depth": depth, "silhouette": mask}[kind], image
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth", "silhouette"])
+def test_what_is_read_back_equals_the_direct_call(tmp_path: Path, kind: str) -> None:
+    config = configured(kind)
+    state = trained(config)
+    export(tmp_path, state, config, seed=1)
+    loaded = {
+        name: jax.export.deserialize(bytearray((tmp_path / f"{name}.stablehlo").read_bytes()))
+        for name in ("encoder", "policy")
+    }
+    actor = jax.tree.map(lambda x: x[1], state.sac.actor)
+
+    def direct(image: Image, target: jax.Array, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        code = encoders.encode(state.encoder, encoders.network_input(image, jnp.asarray([7]), config), config)
+        return code, sac.act(None, actor, jnp.concatenate([code, target, qpos]), config.sac)
+
+    for count in (1, 3):  # a batch of any size
+        picture, image = pictures(kind, count, config.scene.image_size)
+        target = jax.random.normal(jax.random.key(2), (count, config.encoder.code_size))
+        qpos = jax.random.normal(jax.random.key(3), (count, NUM_JOINTS))
+        code, action = jax.vmap(direct)(image, target, qpos)
+        np.testing.assert_allclose(loaded["encoder"].call(picture), code, atol=1e-4)
+        found, similarity = loaded["policy"].call(picture, target, qpos)
+        np.testing.assert_allclose(found, action, atol=1e-4)
+        norms = np.linalg.norm(code, axis=-1) * np.linalg.norm(target, axis=-1)
+        np.testing.assert_allclose(similarity, np.sum(code * target, axis=-1) / norms, atol=1e-4)
+
+
+def test_interface_describes_the_files_and_they_need_no_package(tmp_path: Path) -> None:
+    config = configured("rgb")
+    export(tmp_path, trained(config), config)
+    about = json.loads((tmp_path / "interface.json").read_text())
+    size = config.scene.image_size
+    assert about["functions"]["encoder"]["inputs"] == [
+        {"name": "picture", "shape": ["batch", size, size, 3], "dtype": "uint8"}
+    ]
+    assert [x["name"] for x in about["functions"]["policy"]["outputs"]] == ["action", "similarity"]
+    assert set(about["functions"]["policy"]["platforms"]) == {"cpu", "cuda", "tpu"}
+    code = (
+        "import sys; from pathlib import Path; import numpy as np; import jax.export;"
+        f"f = jax.export.deserialize(bytearray(Path({str(tmp_path / 'encoder.stablehlo')!r}).read_bytes()));"
+        f"print(f.call(np.zeros((2, {size}, {size}, 3), np.uint8)).shape, 'vsearch_jax' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == f"(2, {config.encoder.code_size}) False"
+
+
+def test_a_policy_that_is_not_there_is_named(tmp_path: Path) -> None:
+    config = configured("rgb")
+    with pytest.raises(ConfigError, match="policy 2 does not exist; allowed: 0 to 1"):
+        export(tmp_path, trained(config), config, seed=2)
+    assert not any(tmp_path.iterdir())

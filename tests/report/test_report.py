@@ -1,0 +1,171 @@
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from samples.made_up import evaluation, reach, search, trials
+from vsearch_jax import report
+from vsearch_jax.config import Config
+from vsearch_jax.report.page import CAPTIONS
+from vsearch_jax.report.table import rows
+
+CONFIG = Config.preset("smoke")
+CONTRACT = {
+    "success_rate",
+    "success_rate_ci95",
+    "episodes",
+    "evaluations_mean",
+    "evaluations_p99",
+    "final_cosine_mean",
+    "rotation_error_deg_mean",
+    "rotation_error_deg_median",
+    "translation_error_cm_mean",
+    "false_positive_rate",
+    "unreachable_rate",
+    "joint_travel_rad_mean",
+    "motion_time_s_mean",
+    "plans_mean",
+}
+
+
+@pytest.fixture(scope="module")
+def arrays() -> dict[str, Any]:
+    return evaluation(num_seeds=3)
+
+
+@pytest.fixture(scope="module")
+def results(arrays: dict[str, Any]) -> dict[str, Any]:
+    return report.results(arrays, CONFIG, {"encoder": 1.5, "policy": 2.5})
+
+
+def lines() -> list[dict[str, Any]]:
+    encoder = [{"iteration": i, "stage": "encoder", "seconds": 0.1, "encoder_loss": 1 / (i + 1)} for i in range(8)]
+    policy = [
+        {"iteration": i, "stage": "policy", "seconds": 0.1, "reward": -1.0 + 0.1 * i, "critic_loss": 1.0, "alpha": 0.1}
+        for i in range(8, 24)
+    ]
+    return [*encoder, *policy]
+
+
+def test_results_have_the_names_of_the_contract(results: dict[str, Any]) -> None:
+    for name in report.SEARCHERS:
+        assert results[name].keys() >= CONTRACT
+    assert results["sac"].keys() >= {"steps_lower_bound_mean", "environment_steps", "seeds"}
+    assert results.keys() >= {"thesis", "versions", "wall_seconds"}
+    assert [seed["seed"] for seed in results["sac"]["seeds"]] == [0, 1, 2]
+    assert all(seed.keys() >= CONTRACT for seed in results["sac"]["seeds"])
+    json.dumps(results, allow_nan=False)
+
+
+def test_numbers_are_those_of_the_arrays(arrays: dict[str, Any], results: dict[str, Any]) -> None:
+    ours, raw = results["cma_es"], arrays["cma_es"]
+    assert ours["success_rate"] == pytest.approx(raw["is_success"].mean())
+    assert ours["evaluations_p99"] == pytest.approx(np.percentile(raw["evaluations"], 99))
+    degrees = [math.degrees(error) for error in raw["rotation_error"]]
+    assert ours["rotation_error_deg_mean"] == pytest.approx(sum(degrees) / 12, rel=1e-5)
+    assert ours["translation_error_cm_mean"] == pytest.approx(100 * raw["translation_error"].mean(), rel=1e-5)
+    assert ours["unreachable_rate"] == pytest.approx(raw["unreachable"].sum() / raw["evaluations"].sum())
+    for key in ("evaluations_mean", "rotation_error_deg_mean"):
+        low, high = ours[f"{key}_ci95"]
+        assert low <= ours[key] <= high and low < high
+    seeds = results["sac"]["seeds"]
+    assert results["sac"]["success_rate"] == pytest.approx(np.mean([seed["success_rate"] for seed in seeds]))
+    assert results["sac"]["evaluations_over_lower_bound"] == pytest.approx(4 / 3)
+
+
+@pytest.mark.parametrize(
+    ("successes", "total", "low", "high"),
+    # Newcombe 1998, Statistics in Medicine 17, table I, method 3 (Wilson's score interval).
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_rates_have_wilsons_interval(successes: int, total: int, low: float, high: float) -> None:
+    some = trials((total,), 5) | {"is_success": np.arange(total) < successes}
+    raw = {"random_search": some, "cma_es": some, "sac": {k: v for k, v in trials((1, 4), 5).items()}}
+    interval = report.results(raw, CONFIG, {})["random_search"]["success_rate_ci95"]
+    assert interval == pytest.approx([low, high], abs=5e-5)
+
+
+def test_one_trial_has_no_interval_for_means() -> None:
+    one = trials((1,), 5)
+    raw = {"random_search": one, "cma_es": one, "sac": trials((1, 1), 5)}
+    summary = report.results(raw, CONFIG, {})
+    assert summary["cma_es"]["evaluations_mean_ci95"] is None
+    assert all(len(cells) == 3 for _, cells in rows(summary))
+
+
+def test_an_arm_without_speeds_has_no_times(arrays: dict[str, Any]) -> None:
+    blank = {name: raw | {"motion_time": np.full_like(raw["motion_time"], np.nan)} for name, raw in arrays.items()}
+    summary = report.results(blank, CONFIG, {})
+    assert summary["sac"]["motion_time_s_mean"] is None
+    json.dumps(summary, allow_nan=False)
+    assert dict(rows(summary))["time of the motions, mean (s)"][0].ours == ""
+
+
+def test_a_search_that_saw_nothing_has_no_mean_cosine(arrays: dict[str, Any]) -> None:
+    blind = arrays | {"cma_es": arrays["cma_es"] | {"final_cosine": np.full(12, -np.inf)}}
+    summary = report.results(blind, CONFIG, {})
+    assert summary["cma_es"]["final_cosine_mean"] is None
+    json.dumps(summary, allow_nan=False)
+
+
+def test_help_is_counted_apart(arrays: dict[str, Any]) -> None:
+    helped = np.arange(120).reshape(3, 40) % 4 == 0
+    policies = arrays["sac"] | {"num_helped": helped.astype(np.int32), "is_success": np.ones((3, 40), bool)}
+    summary = report.results(arrays | {"sac": policies}, CONFIG, {})["sac"]
+    assert (summary["success_rate"], summary["helped_rate"], summary["unaided_success_rate"]) == (1.0, 0.25, 0.75)
+
+
+def test_table_shows_ours_beside_the_thesis(results: dict[str, Any]) -> None:
+    console = Console(width=80, record=True, force_terminal=False)
+    report.print_table(results, console)
+    text = console.export_text()
+    rate = results["random_search"]["success_rate"]
+    assert re.search(rf"success \(%\).* {100 * rate:.2f} .*–.* 95\.00 ", text)
+    assert "40.00–60.00" in text and "…" not in text
+    assert "SAC seed 2" in text
+
+
+def test_report_writes_results_figures_and_one_page(
+    tmp_path: Path, arrays: dict[str, Any], results: dict[str, Any]
+) -> None:
+    pictures = report.draw(results, arrays, search(), reach(), lines(), CONFIG)
+    report.write(tmp_path, results, pictures, CONFIG)
+    assert json.loads((tmp_path / "results.json").read_text()) == json.loads(json.dumps(results))
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == len(pictures) == 7
+    assert "http" not in page
+    for name in pictures:
+        with Image.open(tmp_path / "figures" / f"{name}.png") as image:
+            assert min(image.size) > 200
+            assert np.asarray(image.convert("L")).std() > 5, f"{name} is blank"
+
+
+def test_figures_stand_runs_that_found_nothing(arrays: dict[str, Any]) -> None:
+    nothing = {name: values | {"is_success": np.zeros_like(values["is_success"])} for name, values in arrays.items()}
+    summary = report.results(nothing, CONFIG, {})
+    no_band = dataclasses.replace(reach(), is_reachable=jnp.zeros((12, 7), bool))
+    pictures = report.draw(summary, nothing, search(), no_band, [], CONFIG)
+    assert set(pictures) == set(CAPTIONS)
+    for picture in pictures.values():
+        picture.canvas.draw()
+        assert picture.axes
+
+
+def test_search_strip_shows_every_step_and_the_target() -> None:
+    images = np.linspace(0, 1, 4 * 8 * 8 * 3, dtype=np.float32).reshape(4, 8, 8, 3)
+    picture = report.search_strip(images, [0.1, 0.5, 0.9, 0.99], images[0])
+    assert [axes.get_xlabel() for axes in picture.axes] == [
+        "start: 0.100",
+        "step 1: 0.500",
+        "step 2: 0.900",
+        "step 3: 0.990",
+        "target",
+    ]

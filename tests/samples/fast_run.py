@@ -1,0 +1,72 @@
+"""A run without scene and networks in place of the real one: what is tested is the loop around it.
+
+As a program it is the `vsearch` command over that run: `python fast_run.py train --preset smoke --out DIR`.
+"""
+
+import functools
+import time
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from samples import made_up
+from vsearch_jax.cli.main import main
+from vsearch_jax.config import Config
+from vsearch_jax.runs import loop
+from vsearch_jax.training import POLICY_METRICS
+from vsearch_jax.types import ReachabilityMap
+
+CHUNK_SECONDS = 3.0  # a test has so long to interrupt a chunk, on a machine that stalls too
+
+
+@flax.struct.dataclass
+class State:
+    weights: jax.Array
+    reach: ReachabilityMap
+    key: jax.Array
+    step: jax.Array
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init(key: jax.Array, config: Config) -> State:
+    return State(jax.random.normal(key, (1000,)), made_up.reach(), key, jnp.zeros((), jnp.int32))
+
+
+@functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
+def _train(state: State, config: Config) -> tuple[State, dict[str, jax.Array]]:
+    length = config.chunk_length
+    iterations = state.step + jnp.arange(length)
+    noise = jax.random.normal(jax.random.fold_in(state.key, state.step), state.weights.shape)
+    is_encoder = iterations < config.encoder.num_updates
+    metrics = {
+        name: jnp.where(is_encoder, jnp.nan, 1.0 / (1 + iterations).astype(jnp.float32)) for name in POLICY_METRICS
+    }
+    metrics["encoder_loss"] = jnp.where(is_encoder, state.weights[:length] ** 2, jnp.nan)
+    metrics["stage"] = jnp.where(is_encoder, 0, 1).astype(jnp.int32)
+    step = jnp.minimum(state.step + length, config.num_iterations)
+    return State(jnp.sin(state.weights + noise), state.reach, state.key, step), metrics
+
+
+def train(state: State, config: Config) -> tuple[State, dict[str, jax.Array]]:
+    time.sleep(CHUNK_SECONDS)
+    return _train(state, config)
+
+
+def evaluate(state: State, config: Config) -> dict[str, Any]:
+    return made_up.evaluation(config.sac.num_seeds)
+
+
+def record_search(state: State, config: Config) -> dict[str, Any]:
+    return made_up.search()
+
+
+def install() -> None:
+    """Puts the stand-in in the place of the real run."""
+    loop.init, loop.train, loop.evaluate, loop.record_search = init, train, evaluate, record_search
+
+
+if __name__ == "__main__":
+    install()
+    main()

@@ -1,0 +1,38 @@
+"""The pool of lanes gives each problem what it would get alone."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vsearch_jax.xla import lane_pool
+
+JOB = lane_pool.Job(
+    begin=lambda problem, state, is_new: jnp.where(is_new, jnp.stack([problem, jnp.int32(0)]), state),
+    step=lambda _, state: jnp.where(state[0] <= 0, state, state + jnp.array([-1, 1])),
+    is_done=lambda state: state[0] <= 0,
+    finish=lambda problem, state: state[1] * 1000 + problem,
+)
+
+
+def _count(num_lanes: int, _, problems):
+    order = lane_pool.in_order(problems >= 0)
+    return lane_pool.run(JOB, problems, order, jnp.zeros((num_lanes, 2), jnp.int32), jnp.full_like(problems, -7))
+
+
+@pytest.mark.parametrize("num_lanes", [1, 7, 16, 64])
+def test_every_problem_is_worked_on_once_and_to_its_end(num_lanes):
+    problems = np.random.default_rng(0).integers(-3, 200, 150).astype(np.int32)
+    found = jax.jit(functools.partial(_count, num_lanes, None))(problems)
+    np.testing.assert_array_equal(found, np.where(problems < 0, -7, problems * 1001))
+
+
+def test_vmap_of_vmap_is_one_larger_batch():
+    count = lane_pool.flattened(functools.partial(_count, 8))
+    problems = jnp.arange(24).reshape(2, 3, 4)
+    found = jax.jit(jax.vmap(jax.vmap(lambda p: count(None, p))))(problems)
+    np.testing.assert_array_equal(found, problems * 1001)
+    with pytest.raises(NotImplementedError, match="cannot be mapped over"):
+        jax.vmap(lane_pool.flattened(lambda shared, p: p + shared))(jnp.ones(2), jnp.ones((2, 3)))

@@ -1,0 +1,1 @@
+"""A trained encoder and policy as files that run without this package."""

@@ -1,0 +1,1 @@
+"""Rays, level sets and triangles: what each pixel hits."""

@@ -1,0 +1,1 @@
+"""Textures: compiled into one atlas, looked up for each pixel."""

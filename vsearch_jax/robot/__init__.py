@@ -1,0 +1,1 @@
+"""The arm in its scene: kinematics, limits, clearance."""

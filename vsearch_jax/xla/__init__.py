@@ -1,0 +1,1 @@
+"""What XLA needs and mathematics does not: lane pool, batch layout, fusion boundary."""
