@@ -23,8 +23,8 @@ def views(name: str) -> np.ndarray:
     elevation = jnp.mean(env.reach.band)
 
     def picture(azimuth: jax.Array) -> jax.Array:
-        qpos, _ = env.solve(View(azimuth, elevation), env.arm.home)
-        return env.picture(qpos)[1].rgb
+        qpos, _ = env.solve_joints(View(azimuth, elevation), env.arm.home)
+        return env.wrist_image(qpos)[1].rgb
 
     return np.asarray(jax.jit(jax.vmap(picture))(jnp.deg2rad(AZIMUTHS_DEG.astype(np.float32))))
 

@@ -12,7 +12,7 @@ from jax import Array
 from vsearch_jax.config import EnvConfig
 from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.search import SearchArgs
-from vsearch_jax.types import Camera, EpisodeState, Sight, View
+from vsearch_jax.types import Camera, EpisodeState, Observation, View
 
 BAND = (math.radians(40.0), math.radians(70.0))
 THRESHOLD = 0.98
@@ -119,32 +119,34 @@ class SphereEnv(Env):
         code = jnp.outer(azimuth, elevation / math.sqrt(3.0)).reshape(-1)
         return code * math.sqrt(code.size)  # norm 1 becomes mean square 1
 
-    def see(self, view: View) -> Sight:
+    def observe_view(self, view: View) -> Observation:
         camera = Camera(position=direction(view), rotation=jnp.eye(3), fovy=jnp.ones(()))
-        return Sight(view=view, qpos=jnp.stack([view.azimuth, view.elevation]), camera=camera, code=self.code(view))
+        return Observation(
+            view=view, qpos=jnp.stack([view.azimuth, view.elevation]), camera=camera, code=self.code(view)
+        )
 
     def reset(self, rng: Array) -> State:
         initial, target = (jax.tree.map(lambda x: x[0], random_views(key, 1)) for key in jax.random.split(rng))
-        return self.start(self.see(initial), self.see(target))
+        return self.start(self.observe_view(initial), self.observe_view(target))
 
-    def start(self, sight: Sight, target: Sight) -> State:
+    def start(self, observation: Observation, target: Observation) -> State:
         zero = jnp.zeros(())
         info = {"terminated": zero, "truncated": zero, "is_reachable": jnp.ones(())}
-        metrics = {"similarity": cosine_similarity(sight.code, target.code)} | no_motion()
-        episode = EpisodeState(sight=sight, target=target, num_steps=jnp.zeros((), jnp.int32))
+        metrics = {"similarity": cosine_similarity(observation.code, target.code)} | no_motion()
+        episode = EpisodeState(observation=observation, target=target, num_steps=jnp.zeros((), jnp.int32))
         return State(episode, self.observe(episode), zero, zero, metrics, info)
 
     def observe(self, episode: EpisodeState) -> Array:
-        return jnp.concatenate([episode.sight.code, episode.target.code, episode.sight.qpos])
+        return jnp.concatenate([episode.observation.code, episode.target.code, episode.observation.qpos])
 
     def step(self, state: State, action: Array) -> State:
         episode = state.pipeline_state
         delta = action * math.radians(self.config.action_scale_deg)
-        old = episode.sight
+        old = episode.observation
         view = View(wrap_angle(old.view.azimuth + delta[0]), old.view.elevation + delta[1])
         is_reachable = (view.elevation >= BAND[0]) & (view.elevation <= BAND[1])
-        sight = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), self.see(view), old)
-        similarity = cosine_similarity(sight.code, episode.target.code)
+        observation = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), self.observe_view(view), old)
+        similarity = cosine_similarity(observation.code, episode.target.code)
         is_found = is_reachable & (similarity >= self.config.threshold)
         reward = jnp.where(is_found, self.config.success_reward, similarity - 1.0)
         reward = jnp.where(is_reachable, reward, self.config.unreachable_reward)
@@ -154,7 +156,7 @@ class SphereEnv(Env):
             "truncated": ((num_steps >= self.config.episode_length) & ~is_found).astype(jnp.float32),
             "is_reachable": is_reachable.astype(jnp.float32),
         }
-        episode = EpisodeState(sight=sight, target=episode.target, num_steps=num_steps)
+        episode = EpisodeState(observation=observation, target=episode.target, num_steps=num_steps)
         return State(
             episode, self.observe(episode), reward, info["terminated"], {"similarity": similarity} | no_motion(), info
         )

@@ -18,7 +18,7 @@ from vsearch_jax import render
 from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv, check_band
 from vsearch_jax.search import sac
-from vsearch_jax.types import Sight, TrainState, Transition
+from vsearch_jax.types import Observation, TrainState, Transition
 
 ENCODER_STAGE, POLICY_STAGE = 0, 1
 POLICY_METRICS = (
@@ -48,9 +48,9 @@ def init(key: Array, config: Config) -> TrainState:
       SceneError: arm or object can't be loaded.
     """
     env = ViewSearchEnv(config, encoders.init(jax.random.fold_in(key, _ENCODER_INIT), config))
-    sight = jax.eval_shape(env.random_sight, key)
-    pool = _zeros(sight, (config.encoder.pool_size,))
-    start = jax.eval_shape(env.start, sight, sight)
+    observation = jax.eval_shape(env.random_observation, key)
+    pool = _zeros(observation, (config.encoder.pool_size,))
+    start = jax.eval_shape(env.start, observation, observation)
     num_seeds, num_envs = config.sac.num_seeds, config.sac.num_envs
     transition = jax.eval_shape(transition_of, start, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), start)
     seed_keys = jax.random.split(jax.random.fold_in(key, _SAC_INIT), num_seeds)
@@ -147,8 +147,8 @@ def training_example(key: Array, *, env: ViewSearchEnv) -> tuple[Array, Array]:
     The arm stands in a random configuration, so that its shadow is one more thing to ignore: the target has no shadows.
     """
     pose_key, light_key, camera_key, picture_key = jax.random.split(key, 4)
-    _, qpos = env.sample_pose(pose_key)
-    data, camera = env.stand(qpos)
+    _, qpos = env.random_pose(pose_key)
+    data, camera = env.forward(qpos)
     object_ids = jnp.asarray(env.scene.object_geom_ids)
 
     size, decoder_size = env.config.scene.image_size, env.config.encoder.decoder_size
@@ -172,7 +172,7 @@ def finish_encoder(index: Array, state: TrainState, *, config: Config) -> TrainS
     # `index` is 0. Without it nothing here would change from one iteration to the next, and XLA would move all of it
     # out of the loop, to be done in each chunk.
     keys = jax.random.split(jax.random.fold_in(state.key, _POOL + index), config.encoder.pool_size)
-    pool, raw = jax.lax.map(functools.partial(_raw_sight, env), keys, batch_size=_POOL_BATCH)
+    pool, raw = jax.lax.map(functools.partial(_raw_observation, env), keys, batch_size=_POOL_BATCH)
     mean, whitening = encoders.fit_whitening(raw, config.encoder.whitening_power)
     encoder = state.encoder.replace(latent_mean=mean, whitening=whitening)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
     pool = pool.replace(code=jax.vmap(functools.partial(encoders.code_of, encoder))(raw))
@@ -182,18 +182,18 @@ def finish_encoder(index: Array, state: TrainState, *, config: Config) -> TrainS
     return state.replace(encoder=encoder, pool=pool, env=states)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
 
 
-def _raw_sight(env: ViewSearchEnv, key: Array) -> tuple[Sight, Array]:
-    """Returns a random sight, its code still to be filled in, and the raw latent f32[Z] of its picture."""
-    view, qpos = env.sample_pose(key)
-    camera, raw = env.raw_look(qpos)
-    return Sight(view=view, qpos=qpos, camera=camera, code=jnp.zeros_like(raw)), raw
+def _raw_observation(env: ViewSearchEnv, key: Array) -> tuple[Observation, Array]:
+    """Returns a random observation, its code still to be filled in, and the raw latent f32[Z] of its picture."""
+    view, qpos = env.random_pose(key)
+    camera, raw = env.observe_latent(qpos)
+    return Observation(view=view, qpos=qpos, camera=camera, code=jnp.zeros_like(raw)), raw
 
 
 # -- policy ---------------------------------------------------------------------------------------------------------
 
 
 def policy_iteration(
-    i: Array, carry: tuple[Any, Any, Any], *, env: ViewSearchEnv, pool: Sight, key: Array
+    i: Array, carry: tuple[Any, Any, Any], *, env: ViewSearchEnv, pool: Observation, key: Array
 ) -> tuple[tuple[Any, Any, Any], dict[str, Array]]:
     """Does policy iteration `i` (of the run) for every seed: each environment steps once, then come the updates."""
     number = i - env.config.encoder.num_updates
@@ -206,7 +206,7 @@ def policy_iteration(
 
 
 def _policy_iteration(
-    number: Array, carry: tuple[Any, Any, Any], key: Array, *, env: ViewSearchEnv, pool: Sight
+    number: Array, carry: tuple[Any, Any, Any], key: Array, *, env: ViewSearchEnv, pool: Observation
 ) -> tuple[tuple[Any, Any, Any], dict[str, Array]]:
     sac_state, states, replay = carry
     config = env.config.sac
@@ -235,9 +235,11 @@ def _policy_iteration(
     return (sac_state, states, replay), metrics | losses
 
 
-def _policy_update(i: Array, carry: tuple[Any, Any], *, key: Array, replay: Any, pool: Sight, config: Config) -> Any:
+def _policy_update(
+    i: Array, carry: tuple[Any, Any], *, key: Array, replay: Any, pool: Observation, config: Config
+) -> Any:
     sample_key, relabel_key, update_key = jax.random.split(jax.random.fold_in(key, i), 3)
-    transitions = sac.sample(sample_key, replay, config.sac.batch_size)
+    transitions = sac.sample_batch(sample_key, replay, config.sac.batch_size)
     transitions = sac.relabel(relabel_key, transitions, pool.code, config.env, config.sac)
     return sac.update(update_key, carry[0], transitions, config.sac)
 
@@ -245,24 +247,23 @@ def _policy_update(i: Array, carry: tuple[Any, Any], *, key: Array, replay: Any,
 def transition_of(state: Any, action: Array, next_state: Any) -> Transition:
     """Returns the transition from brax State `state` by `action` (f32[2]) to `next_state`, before any restart."""
     return Transition(
-        observation=state.obs,
+        obs=state.obs,
         action=action,
         reward=next_state.reward,
-        next_observation=next_state.obs,
+        next_obs=next_state.obs,
         terminated=next_state.info["terminated"],
-        truncated=next_state.info["truncated"],
         is_reachable=next_state.info["is_reachable"],
     )
 
 
-def pool_start(key: Array, *, env: ViewSearchEnv, pool: Sight) -> Any:
+def pool_start(key: Array, *, env: ViewSearchEnv, pool: Observation) -> Any:
     """Returns the start of an episode whose initial view and target are random entries of `pool`: it costs no image."""
     indices = jax.random.randint(key, (2,), 0, pool.qpos.shape[0])
     initial, target = (jax.tree.map(lambda x, n=n: x[indices[n]], pool) for n in range(2))
     return env.start(initial, target)
 
 
-def restart_ended(key: Array, state: Any, *, env: ViewSearchEnv, pool: Sight) -> Any:
+def restart_ended(key: Array, state: Any, *, env: ViewSearchEnv, pool: Observation) -> Any:
     """Returns `state`, or the start of a new episode where it terminated or was truncated."""
     is_ended = (state.info["terminated"] + state.info["truncated"]) > 0
     return jax.tree.map(lambda new, old: jnp.where(is_ended, new, old), pool_start(key, env=env, pool=pool), state)

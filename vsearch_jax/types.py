@@ -153,7 +153,7 @@ class ReachabilityMap:
 
 
 @flax.struct.dataclass
-class Sight:
+class Observation:
     """What the wrist camera sees from where the arm stands.
 
     Attributes:
@@ -174,13 +174,13 @@ class EpisodeState:
     """The view-search environment between two steps.
 
     Attributes:
-      sight: Sight of the present view.
-      target: Sight of the view that is looked for.
+      observation: Observation of the present view.
+      target: Observation of the view that is looked for.
       num_steps: i32[], steps done in the episode.
     """
 
-    sight: Sight
-    target: Sight
+    observation: Observation
+    target: Observation
     num_steps: Array
 
 
@@ -188,21 +188,19 @@ class Transition(NamedTuple):
     """One step of a view-search episode, as the replay keeps it.
 
     Attributes:
-      observation: f32[265].
+      obs: f32[265].
       action: f32[2] in [-1, 1].
       reward: f32[].
-      next_observation: f32[265], of the state before any reset.
+      next_obs: f32[265], of the state before any reset.
       terminated: f32[], 1 where the episode ended at the threshold: no value follows.
-      truncated: f32[], 1 where the episode ran out of steps: the value goes on.
       is_reachable: f32[], 1 where the arm could do the step; 0 where it stayed and `unreachable_reward` was paid.
     """
 
-    observation: Array
+    obs: Array
     action: Array
     reward: Array
-    next_observation: Array
+    next_obs: Array
     terminated: Array
-    truncated: Array
     is_reachable: Array
 
 
@@ -249,7 +247,7 @@ class TrainState:
     Attributes:
       encoder: EncoderState.
       reach: ReachabilityMap of the arm, mount and object.
-      pool: Sight of f32[N, ...]: random reachable views, seen once, from which training episodes start;
+      pool: Observation of f32[N, ...]: random reachable views, seen once, from which training episodes start;
         zeros until the encoder is done.
       sac: SACState, leading axis S.
       env: brax State of the training environments, leading axes S, num_envs.
@@ -260,7 +258,7 @@ class TrainState:
 
     encoder: EncoderState
     reach: ReachabilityMap
-    pool: Sight
+    pool: Observation
     sac: SACState
     env: Any
     replay: Any

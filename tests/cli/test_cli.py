@@ -18,7 +18,7 @@ from vsearch_jax.cli.main import main
 from vsearch_jax.config import Config
 from vsearch_jax.film import video
 from vsearch_jax.runs import checkpoint, loop
-from vsearch_jax.runs.folder import RunError, held, read_config, read_seed
+from vsearch_jax.runs.folder import RunError, lock_folder, read_config, read_seed
 from vsearch_jax.runs.metrics_log import STAGES, MetricsLog, read_metrics
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -228,7 +228,7 @@ def test_the_last_preset_counts(capsys: pytest.CaptureFixture[str], tmp_path: Pa
 def test_a_damaged_seed_is_found_before_anything_runs(
     quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path, seed: Any
 ) -> None:
-    loop.start(tmp_path, Config.preset("smoke"), seed=0)
+    loop.start_run(tmp_path, Config.preset("smoke"), seed=0)
     values = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(values | {"seed": seed}))
     before = contents(tmp_path)
@@ -241,7 +241,7 @@ def test_an_unfinished_run_is_not_evaluated(
     quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str
 ) -> None:
     config = Config.preset("smoke")
-    loop.start(tmp_path / "run", config, seed=0)
+    loop.start_run(tmp_path / "run", config, seed=0)
     message = fails(capsys, *command.format(run=tmp_path / "run").split())
     assert f"0 of {config.num_iterations} iterations" in message and "--resume" in message
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -270,7 +270,7 @@ def test_a_film_is_of_the_run_and_as_asked(quick: None, monkeypatch: pytest.Monk
 
 
 def test_damaged_config_is_one_line(quick: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    loop.start(tmp_path, Config.preset("smoke"), seed=0)
+    loop.start_run(tmp_path, Config.preset("smoke"), seed=0)
     whole = (tmp_path / "config.json").read_text()
     for text, message in {"": "not JSON", "[]": "no JSON object", whole.replace('"arm"', '"leg"'): "leg"}.items():
         (tmp_path / "config.json").write_text(text)
@@ -401,13 +401,13 @@ def test_a_folder_in_use_is_refused(quick: None, capsys: pytest.CaptureFixture[s
     out = tmp_path / "run"
     out.mkdir()
     command = ["train", "--preset", "smoke", "--out", str(out)]
-    with held(out):
+    with lock_folder(out):
         assert "another process is at work in" in fails(capsys, *command)
         assert not any(out.iterdir())
-        with pytest.raises(RunError, match="another process"), held(out):
+        with pytest.raises(RunError, match="another process"), lock_folder(out):
             pass
     main.main(command)  # the hold ends with its block
-    with held(out):
+    with lock_folder(out):
         assert "another process is at work in" in fails(capsys, *command, "--resume")
         assert "another process is at work in" in fails(capsys, "eval", str(out))
 

@@ -46,8 +46,8 @@ def test_sizes_are_those_of_the_contract(env, reset):
     assert (env.observation_size, env.action_size) == (265, 2)
     state = reset(jax.random.key(0))
     assert state.obs.shape == (265,)
-    sight, target = state.pipeline_state.sight, state.pipeline_state.target
-    np.testing.assert_array_equal(state.obs, np.concatenate([sight.code, target.code, sight.qpos]))
+    observation, target = state.pipeline_state.observation, state.pipeline_state.target
+    np.testing.assert_array_equal(state.obs, np.concatenate([observation.code, target.code, observation.qpos]))
 
 
 def test_an_arm_without_a_band_is_refused(env):
@@ -62,7 +62,7 @@ def test_an_arm_without_a_band_is_refused(env):
 def test_initial_view_and_target_are_random_over_the_band(env, reset):
     keys = jax.random.split(jax.random.key(1), 32)
     states = [reset(key) for key in keys]
-    elevations = np.array([s.pipeline_state.sight.view.elevation for s in states])
+    elevations = np.array([s.pipeline_state.observation.view.elevation for s in states])
     azimuths = np.array([s.pipeline_state.target.view.azimuth for s in states])
     low, high = np.asarray(env.reach.band)
     assert ((elevations >= low - 1e-6) & (elevations <= high + 1e-6)).all()
@@ -71,29 +71,31 @@ def test_initial_view_and_target_are_random_over_the_band(env, reset):
 
 
 def test_camera_stands_where_c_mujoco_puts_it_and_within_tolerance_of_the_view(env, reset):
-    sight = reset(jax.random.key(2)).pipeline_state.sight
+    observation = reset(jax.random.key(2)).pipeline_state.observation
     model = env.scene.mj_model
     data = mujoco.MjData(model)
-    data.qpos[:] = sight.qpos
+    data.qpos[:] = observation.qpos
     mujoco.mj_forward(model, data)
-    np.testing.assert_allclose(sight.camera.position, data.cam_xpos[env.scene.camera_id], atol=1e-5)
-    np.testing.assert_allclose(sight.camera.rotation.reshape(-1), data.cam_xmat[env.scene.camera_id], atol=1e-5)
+    np.testing.assert_allclose(observation.camera.position, data.cam_xpos[env.scene.camera_id], atol=1e-5)
+    np.testing.assert_allclose(observation.camera.rotation.reshape(-1), data.cam_xmat[env.scene.camera_id], atol=1e-5)
     assert data.ncon == 0
-    wanted = view_pose(sight.view, env.center, env.scene.radius)
-    assert np.linalg.norm(wanted.translation() - sight.camera.position) < CONFIG.ik.position_tolerance
+    wanted = view_pose(observation.view, env.center, env.scene.radius)
+    assert np.linalg.norm(wanted.translation() - observation.camera.position) < CONFIG.ik.position_tolerance
 
 
 def test_a_step_moves_by_the_scaled_action_and_pays_cosine_less_one(env, reset, step):
     state = reset(jax.random.key(3))
     before = state.pipeline_state
-    inward = np.sign(np.mean(env.reach.band) - before.sight.view.elevation)
+    inward = np.sign(np.mean(env.reach.band) - before.observation.view.elevation)
     after = step(state, jnp.array([0.5, 0.1 * inward]))
-    sight = after.pipeline_state.sight
+    observation = after.pipeline_state.observation
     assert after.info["is_reachable"] == 1.0
-    turn = np.angle(np.exp(1j * float(sight.view.azimuth - before.sight.view.azimuth)))
+    turn = np.angle(np.exp(1j * float(observation.view.azimuth - before.observation.view.azimuth)))
     np.testing.assert_allclose(np.rad2deg(turn), 15.0, atol=1e-3)
-    np.testing.assert_allclose(np.rad2deg(sight.view.elevation - before.sight.view.elevation), 3.0 * inward, atol=1e-3)
-    similarity = cosine_similarity(sight.code, before.target.code)
+    np.testing.assert_allclose(
+        np.rad2deg(observation.view.elevation - before.observation.view.elevation), 3.0 * inward, atol=1e-3
+    )
+    similarity = cosine_similarity(observation.code, before.target.code)
     expected = CONFIG.env.success_reward if similarity >= CONFIG.env.threshold else similarity - 1.0
     np.testing.assert_allclose(after.reward, expected, atol=1e-6)
 
@@ -121,10 +123,10 @@ def test_after_the_end_nothing_changes(reset, step):
 
 def test_the_threshold_terminates_with_two(env, reset, step):
     state = reset(jax.random.key(5))
-    there = env.start(state.pipeline_state.sight, state.pipeline_state.sight)
+    there = env.start(state.pipeline_state.observation, state.pipeline_state.observation)
     after = step(there, jnp.zeros(2))
     assert (after.reward, after.done, after.info["terminated"], after.info["truncated"]) == (2.0, 1.0, 1.0, 0.0)
-    errors = pose_error(after.pipeline_state.sight.camera, after.pipeline_state.target.camera)
+    errors = pose_error(after.pipeline_state.observation.camera, after.pipeline_state.target.camera)
     assert float(errors[0]) < np.deg2rad(2.0)
     assert float(errors[2]) < 5e-3
 

@@ -36,10 +36,10 @@ def _views(env: vs.ViewSearchEnv, count: int):
 
 @pytest.fixture(scope="module")
 def by_path(by_joints):
-    """Sights and motions of eight views, along paths."""
+    """Observations and motions of eight views, along paths."""
     env = _moving(by_joints, reachable="path")
     views, start = _views(env, 8)
-    return jax.jit(jax.vmap(lambda view: env.go(view, start)))(views)
+    return jax.jit(jax.vmap(lambda view: env.move_to_view(view, start)))(views)
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +49,10 @@ def solved(by_joints):
     return jax.jit(jax.vmap(lambda view: by_joints.solve(view, start)))(views)
 
 
-def _errors(env: vs.ViewSearchEnv, views: View, sights) -> tuple[np.ndarray, np.ndarray]:
+def _errors(env: vs.ViewSearchEnv, views: View, observations) -> tuple[np.ndarray, np.ndarray]:
     wanted = jax.vmap(lambda view: view_pose(view, env.center, env.scene.radius))(views)
-    position = np.linalg.norm(wanted.translation() - sights.camera.position, axis=-1)
-    cosine = np.einsum("nij,nij->n", wanted.rotation().as_matrix(), sights.camera.rotation)
+    position = np.linalg.norm(wanted.translation() - observations.camera.position, axis=-1)
+    cosine = np.einsum("nij,nij->n", wanted.rotation().as_matrix(), observations.camera.rotation)
     return position, np.arccos(np.clip((cosine - 1) / 2, -1, 1))
 
 
@@ -67,9 +67,9 @@ def test_a_path_leads_where_kinematics_alone_does(by_path, solved):
 def test_dynamics_end_near_the_view(by_joints):
     env = _moving(by_joints, reachable="path", motion="dynamic")
     views, start = _views(env, 4)
-    sights, motions = jax.jit(jax.vmap(lambda view: env.go(view, start)))(views)
+    observations, motions = jax.jit(jax.vmap(lambda view: env.move_to_view(view, start)))(views)
     is_reachable = np.asarray(motions.is_found)
-    position, turn = _errors(env, views, sights)
+    position, turn = _errors(env, views, observations)
     # The error of IK, 1 mm and 0.1 degrees, and that of the motion.
     assert np.all(position[is_reachable] < 2e-3) and np.all(turn[is_reachable] < np.deg2rad(0.3))
 

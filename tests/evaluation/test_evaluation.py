@@ -15,15 +15,15 @@ import vsearch_jax as vs
 from vsearch_jax import evaluation
 from vsearch_jax.config import ConfigError, EvaluationConfig
 from vsearch_jax.evaluation import step_bound
-from vsearch_jax.types import Sight, View
+from vsearch_jax.types import Observation, View
 
 CONFIG = vs.Config.preset("smoke")
 BOUND = jax.jit(lambda *args: step_bound.steps_lower_bound(*args, CONFIG))
 
 
-def sight(view, code):
-    """Returns a Sight of which only view and code are read."""
-    return Sight(view=view, qpos=None, camera=None, code=code)
+def observation(view, code):
+    """Returns a Observation of which only view and code are read."""
+    return Observation(view=view, qpos=None, camera=None, code=code)
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +94,8 @@ def test_initial_views_are_three_a_quadrant(state):
 @given(st.floats(-3.1, 3.1), st.floats(0.7, 1.2), st.floats(-3.1, 3.1), st.floats(0.7, 1.2))
 def test_bound_is_the_steps_to_the_target_where_only_it_is_found(azimuth, elevation, target_azimuth, target_elevation):
     code = jnp.ones(4)
-    target = sight(View(jnp.float32(target_azimuth), jnp.float32(target_elevation)), code)
-    nowhere = sight(View(jnp.zeros(1), jnp.ones(1)), -jnp.ones((1, 4)))
+    target = observation(View(jnp.float32(target_azimuth), jnp.float32(target_elevation)), code)
+    nowhere = observation(View(jnp.zeros(1), jnp.ones(1)), -jnp.ones((1, 4)))
     initial = View(jnp.float32(azimuth), jnp.float32(elevation))
     # Less one spacing of the grid, 360 / 144 degrees and a twelfth of the band.
     turn = np.abs(np.angle(np.exp(1j * (target_azimuth - azimuth)))) - np.deg2rad(2.5)
@@ -120,12 +120,12 @@ def test_no_way_to_a_view_that_meets_the_threshold_is_shorter_than_the_bound(num
     end = View(target.azimuth + turns + offset, jnp.clip(target.elevation - offset, 0.7, 1.2))
     band = jnp.array([0.7, 1.2])
     grid = step_bound.band_grid(band)
-    sights = [sight(view, repeating_code(view)) for view in (target, grid)]
+    observations = [observation(view, repeating_code(view)) for view in (target, grid)]
     code = repeating_code(end)
-    assert code @ sights[0].code >= 0.98 * 2.0
+    assert code @ observations[0].code >= 0.98 * 2.0
     turn = np.abs(np.angle(np.exp(1j * (float(end.azimuth) - numbers[0]))))
     steps = max(1, int(np.ceil(max(turn, abs(float(end.elevation) - numbers[1])) / np.deg2rad(30.0) - 1e-4)))
-    steps_at_least = int(BOUND(initial, *sights, band))
+    steps_at_least = int(BOUND(initial, *observations, band))
     assert steps_at_least <= steps
     # Nor is it slack: no view that looks alike is further than 60 degrees of azimuth.
     assert steps_at_least <= 2
@@ -133,8 +133,8 @@ def test_no_way_to_a_view_that_meets_the_threshold_is_shorter_than_the_bound(num
 
 def test_bound_takes_the_nearest_view_that_meets_the_threshold():
     code = jnp.ones(4)
-    target = sight(View(jnp.float32(3.0), jnp.float32(1.0)), code)
-    grid = sight(View(jnp.array([0.3, 1.0]), jnp.ones(2)), jnp.stack([code, -code]))
+    target = observation(View(jnp.float32(3.0), jnp.float32(1.0)), code)
+    grid = observation(View(jnp.array([0.3, 1.0]), jnp.ones(2)), jnp.stack([code, -code]))
     steps_at_least = step_bound.steps_lower_bound(
         View(jnp.float32(0.0), jnp.float32(1.0)), target, grid, jnp.array([0.7, 1.2]), CONFIG
     )

@@ -9,7 +9,7 @@ import pytest
 from oracles.planning import Oracle
 from vsearch_jax.config import IKConfig, PlanningConfig, SceneConfig
 from vsearch_jax.geometry import rotation_error, view_pose
-from vsearch_jax.planning import ik, rrt_connect, sample, time_path
+from vsearch_jax.planning import ik, rrt_connect, state_at, time_path
 from vsearch_jax.planning.execution import execute
 from vsearch_jax.robot.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.scene import build_scene
@@ -75,7 +75,7 @@ def test_the_arm_ends_at_the_planned_view(moves):
 def test_c_mujoco_follows_the_same_way_without_contact(moves):
     scene, arm, paths, trajectories, done, _, _, _ = moves
     model, oracle = scene.mj_model, Oracle(scene)
-    at = jax.jit(jax.vmap(lambda trajectory, t: sample(arm, trajectory, t), in_axes=(None, 0)))
+    at = jax.jit(jax.vmap(lambda trajectory, t: state_at(arm, trajectory, t), in_axes=(None, 0)))
     trajectory = jax.tree.map(lambda leaf: leaf[0], trajectories)
     count = round(float(done.time[0]) / model.opt.timestep)
     joints, velocity = (

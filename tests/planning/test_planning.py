@@ -43,7 +43,7 @@ class _Problems:
 
     @functools.cached_property
     def paths(self):
-        return self.plan(self.keys, self.start, self.goal)
+        return self.plan_motion(self.keys, self.start, self.goal)
 
     @functools.cached_property
     def found(self):
@@ -232,7 +232,7 @@ def test_planning_pairs_never_claim_more_room_than_there_is(problems):
         exact = clearance(problems.arm, data)
         gap = look(problems.arm, qpos).gap
         parts = (collision.OBJECT, collision.SELF, collision.OBSTACLE)
-        return jnp.stack([collision.least(problems.arm.planning_pairs, gap, part) for part in parts]), exact
+        return jnp.stack([collision.min_distance(problems.arm.planning_pairs, gap, part) for part in parts]), exact
 
     ours, exact = jax.jit(jax.vmap(both))(problems.start)
     for column, part in enumerate(("object", "self", "obstacles")):

@@ -164,9 +164,9 @@ def test_a_missing_object_leaves_its_distance_infinite():
     setup = _Setup(SceneConfig())
     geoms = collision.Geoms(setup.scene.arm_geom_ids, (), (), ())
     pairs = collision.build_pairs(setup.scene.mj_model, setup.oracle(0), geoms, setup.scene.joint_ids, False)
-    gap = collision.gaps(pairs, setup.fields["geom_xpos"][0], setup.fields["geom_xmat"][0], jnp.float32(0.0))
-    assert np.isinf(collision.least(pairs, gap, collision.OBJECT))
-    assert np.isfinite(collision.least(pairs, gap, collision.SELF))
+    gap = collision.pair_distances(pairs, setup.fields["geom_xpos"][0], setup.fields["geom_xmat"][0], jnp.float32(0.0))
+    assert np.isinf(collision.min_distance(pairs, gap, collision.OBJECT))
+    assert np.isfinite(collision.min_distance(pairs, gap, collision.SELF))
 
 
 _coordinate = st.floats(-0.5, 0.5, width=32)

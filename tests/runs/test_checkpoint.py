@@ -16,9 +16,9 @@ import pytest
 from brax.envs.base import State
 from flax import nnx
 
+from vsearch_jax.config import Config
 from vsearch_jax.runs import checkpoint
 from vsearch_jax.runs.checkpoint import CheckpointError
-from vsearch_jax.config import Config
 
 CONFIG = Config.preset("smoke")
 

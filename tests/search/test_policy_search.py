@@ -12,8 +12,8 @@ import probes
 from vsearch_jax.config import Config
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search import SearchArgs, sac
-from vsearch_jax.search.sac import rollout
-from vsearch_jax.types import Camera, EpisodeState, Sight, View
+from vsearch_jax.search.sac import policy
+from vsearch_jax.types import Camera, EpisodeState, Observation, View
 
 CONFIG = Config()
 SCALE = math.radians(CONFIG.env.action_scale_deg)
@@ -24,10 +24,10 @@ NUM_EPISODES = 64
 def start_at(view: View, aim: View) -> State:
     """The start of an episode whose policy heads for `aim`: the observation is the action that leads there."""
     camera = Camera(position=jnp.zeros(3), rotation=jnp.eye(3), fovy=jnp.ones(()))
-    sight = Sight(view=view, qpos=jnp.stack([aim.azimuth, aim.elevation]), camera=camera, code=jnp.zeros(1))
-    episode = EpisodeState(sight=sight, target=sight, num_steps=jnp.int32(0))
+    observation = Observation(view=view, qpos=jnp.stack([aim.azimuth, aim.elevation]), camera=camera, code=jnp.zeros(1))
+    episode = EpisodeState(observation=observation, target=observation, num_steps=jnp.int32(0))
     info, zero = {"is_reachable": jnp.ones(())}, jnp.zeros(())
-    return State(episode, head_for(view, sight.qpos), zero, zero, metrics_at(view), info)
+    return State(episode, head_for(view, observation.qpos), zero, zero, metrics_at(view), info)
 
 
 def head_for(view: View, aim: jax.Array) -> jax.Array:
@@ -47,20 +47,22 @@ def similarity(view: View) -> jax.Array:
 
 def step(state: State, action: jax.Array) -> State:
     episode = state.pipeline_state
-    old = episode.sight.view
+    old = episode.observation.view
     view = View(wrap_angle(old.azimuth + SCALE * action[0]), old.elevation + SCALE * action[1])
     is_reachable = (view.elevation >= probes.BAND[0] - 1e-6) & (view.elevation <= probes.BAND[1] + 1e-6)
     view = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), view, old)
-    episode = episode.replace(sight=episode.sight.replace(view=view), num_steps=episode.num_steps + 1)
+    episode = episode.replace(observation=episode.observation.replace(view=view), num_steps=episode.num_steps + 1)
     info = {"is_reachable": is_reachable.astype(jnp.float32)}
     metrics = metrics_at(view)
-    return state.replace(pipeline_state=episode, obs=head_for(view, episode.sight.qpos), metrics=metrics, info=info)
+    return state.replace(
+        pipeline_state=episode, obs=head_for(view, episode.observation.qpos), metrics=metrics, info=info
+    )
 
 
 @pytest.fixture
 def run(monkeypatch):
     """Returns the results of episodes from `starts` with policies that head for `aims`, each View of f32[N] rad."""
-    monkeypatch.setattr(rollout, "act", lambda key, actor, observation, config: observation)
+    monkeypatch.setattr(policy, "act", lambda key, actor, observation, config: observation)
 
     def episode(key, view, aim):
         start = start_at(view, aim)

@@ -24,10 +24,10 @@ def transitions(reward, terminated, truncated, size=6) -> Transition:
     num = len(reward)
     observation = jax.random.normal(jax.random.key(11), (2, num, size))
     return Transition(
-        observation=observation[0],
+        obs=observation[0],
         action=jnp.full((num, 2), 0.5),
         reward=jnp.asarray(reward, jnp.float32),
-        next_observation=observation[1],
+        next_obs=observation[1],
         terminated=jnp.asarray(terminated, jnp.float32),
         truncated=jnp.asarray(truncated, jnp.float32),
         is_reachable=jnp.ones(num),
@@ -114,10 +114,10 @@ E0, E1 = jnp.asarray([2.0, 0.0, 0.0, 0.0]), jnp.asarray([0.0, 2.0, 0.0, 0.0])
 def one_transition(code, target, next_code, *, is_reachable=1.0, reward=0.0, num=600) -> Transition:
     joints = jnp.arange(3.0)
     row = Transition(
-        observation=jnp.concatenate([code, target, joints]),
+        obs=jnp.concatenate([code, target, joints]),
         action=jnp.zeros(2),
         reward=jnp.asarray(reward),
-        next_observation=jnp.concatenate([next_code, target, joints + 1.0]),
+        next_obs=jnp.concatenate([next_code, target, joints + 1.0]),
         terminated=jnp.asarray(0.0),
         truncated=jnp.asarray(1.0),
         is_reachable=jnp.asarray(is_reachable),
@@ -145,8 +145,8 @@ def test_relabelling_keeps_a_fifth_and_splits_the_rest_in_thirds():
 def test_relabelling_changes_the_target_alone_and_in_both_observations():
     batch = one_transition(E0, -E0, E1)
     out = sac.relabel(jax.random.key(0), batch, E0[None], ENV, SMALL)
-    np.testing.assert_array_equal(out.observation[:, 4:8], out.next_observation[:, 4:8])
-    for name in ("observation", "next_observation"):
+    np.testing.assert_array_equal(out.observation[:, 4:8], out.next_obs[:, 4:8])
+    for name in ("observation", "next_obs"):
         np.testing.assert_array_equal(getattr(out, name)[:, :4], getattr(batch, name)[:, :4])
         np.testing.assert_array_equal(getattr(out, name)[:, 8:], getattr(batch, name)[:, 8:])
 
@@ -180,10 +180,10 @@ def test_the_replay_overwrites_the_oldest_and_samples_only_what_is_there():
 
     replay = sac.init_replay(Transition(*(jnp.zeros(()) for _ in Transition._fields)), 5)
     replay = sac.insert(replay, rows([1, 2]))
-    seen = set(np.asarray(sac.sample(jax.random.key(0), replay, 64).reward).tolist())
+    seen = set(np.asarray(sac.sample_batch(jax.random.key(0), replay, 64).reward).tolist())
     assert seen == {1.0, 2.0}
     replay = sac.insert(sac.insert(replay, rows([3, 4])), rows([5, 6]))
-    seen = np.asarray(sac.sample(jax.random.key(0), replay, 2000).reward)
+    seen = np.asarray(sac.sample_batch(jax.random.key(0), replay, 2000).reward)
     values, counts = np.unique(seen, return_counts=True)
     assert values.tolist() == [2.0, 3.0, 4.0, 5.0, 6.0]
     assert counts.min() > 300  # uniform: 400 each, standard deviation 18
@@ -266,8 +266,8 @@ def iteration(env, carry, key, *, is_warm):
 
     def one_update(i, state):
         sample_key, relabel_key, key = jax.random.split(jax.random.fold_in(update_key, i), 3)
-        batch = sac.sample(sample_key, replay, TASK.batch_size)
-        codes = batch.next_observation[:, :48]
+        batch = sac.sample_batch(sample_key, replay, TASK.batch_size)
+        codes = batch.next_obs[:, :48]
         return sac.update(key, state, sac.relabel(relabel_key, batch, codes, ENV, TASK), TASK)[0]
 
     if is_warm:
@@ -298,7 +298,7 @@ def episodes(env, actor, keys):
 
     def run(start):
         args = SearchArgs(
-            initial=start.pipeline_state.sight.view,
+            initial=start.pipeline_state.observation.view,
             band=jnp.array(probes.BAND),
             threshold=jnp.float32(ENV.threshold),
             task=sac.PolicyTask(actor, start),
@@ -313,7 +313,7 @@ def test_the_policy_finds_any_target_in_few_more_steps_than_the_bound(policy):
     starts, result = episodes(env, policy, jax.random.split(jax.random.key(7), 500))
     ends, is_found = result.end.state, np.asarray(result.score) >= ENV.threshold
     assert is_found.mean() >= 0.93
-    initial, target = starts.pipeline_state.sight.view, starts.pipeline_state.target.view
+    initial, target = starts.pipeline_state.observation.view, starts.pipeline_state.target.view
     bound = jax.vmap(env.steps_lower_bound)(initial, target)
     steps = np.asarray(result.evaluations)
     assert (steps[is_found] >= np.asarray(bound)[is_found]).all()
@@ -321,6 +321,6 @@ def test_the_policy_finds_any_target_in_few_more_steps_than_the_bound(policy):
     # The result is the end of the episode.
     np.testing.assert_array_equal(ends.info["terminated"], is_found)
     np.testing.assert_array_equal(ends.pipeline_state.num_steps, steps)
-    np.testing.assert_allclose(result.view.elevation, ends.pipeline_state.sight.view.elevation)
+    np.testing.assert_allclose(result.view.elevation, ends.pipeline_state.observation.view.elevation)
     assert (steps[~is_found] == ENV.episode_length).all()
     assert (np.asarray(result.unreachable) <= steps).all()

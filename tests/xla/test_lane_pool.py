@@ -10,15 +10,15 @@ import pytest
 from vsearch_jax.xla import lane_pool
 
 JOB = lane_pool.Job(
-    begin=lambda problem, state, is_new: jnp.where(is_new, jnp.stack([problem, jnp.int32(0)]), state),
+    reset=lambda problem, state, is_new: jnp.where(is_new, jnp.stack([problem, jnp.int32(0)]), state),
     step=lambda _, state: jnp.where(state[0] <= 0, state, state + jnp.array([-1, 1])),
     is_done=lambda state: state[0] <= 0,
-    finish=lambda problem, state: state[1] * 1000 + problem,
+    result=lambda problem, state: state[1] * 1000 + problem,
 )
 
 
 def _count(num_lanes: int, _, problems):
-    order = lane_pool.in_order(problems >= 0)
+    order = lane_pool.queue_where(problems >= 0)
     return lane_pool.run(JOB, problems, order, jnp.zeros((num_lanes, 2), jnp.int32), jnp.full_like(problems, -7))
 
 
@@ -30,9 +30,9 @@ def test_every_problem_is_worked_on_once_and_to_its_end(num_lanes):
 
 
 def test_vmap_of_vmap_is_one_larger_batch():
-    count = lane_pool.flattened(functools.partial(_count, 8))
+    count = lane_pool.flatten_vmap(functools.partial(_count, 8))
     problems = jnp.arange(24).reshape(2, 3, 4)
     found = jax.jit(jax.vmap(jax.vmap(lambda p: count(None, p))))(problems)
     np.testing.assert_array_equal(found, problems * 1001)
     with pytest.raises(NotImplementedError, match="cannot be mapped over"):
-        jax.vmap(lane_pool.flattened(lambda shared, p: p + shared))(jnp.ones(2), jnp.ones((2, 3)))
+        jax.vmap(lane_pool.flatten_vmap(lambda shared, p: p + shared))(jnp.ones(2), jnp.ones((2, 3)))

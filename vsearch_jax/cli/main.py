@@ -19,8 +19,8 @@ from rich.console import Console
 
 from vsearch_jax.cli.commands import DEFAULT_PRESET, Command, Eval, Export, Reach, Train, Video
 from vsearch_jax.config import Config, ConfigError, SceneConfig
-from vsearch_jax.runs.atomic import write
-from vsearch_jax.runs.folder import RunError, claim, claim_file, held, read_config, read_seed
+from vsearch_jax.runs.atomic import write_atomically
+from vsearch_jax.runs.folder import RunError, check_new_file, lock_folder, make_new_folder, read_config, read_seed
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it: 128 + SIGINT."""
@@ -118,12 +118,12 @@ def run_train(command: Train) -> None:
 
     console, config, run = Console(), command.config, command.out
     if not command.resume:
-        claim(run)
-    with held(run):
+        make_new_folder(run)
+    with lock_folder(run):
         with console.status("building the scene, mapping what the arm can reach"):
             state = _resume(command) if command.resume else _start(command)
         with training_progress(console, config, int(state.step)) as progress:
-            state = loop.finish_training(run, state, config, progress.update, progress.stopping)
+            state = loop.train_to_end(run, state, config, progress.update, progress.stopping)
         _evaluate(run, state, config, console)
 
 
@@ -133,13 +133,13 @@ def _start(command: Train) -> Any:
     from vsearch_jax.env import UnreachableError
 
     try:
-        return loop.start(command.out, command.config, command.seed or 0)
+        return loop.start_run(command.out, command.config, command.seed or 0)
     except UnreachableError as error:
         from vsearch_jax import report
 
         picture = command.out.with_name(f"{command.out.name}-reachability.png")
         try:
-            write(picture, report.png(report.reachability(error.reach)))
+            write_atomically(picture, report.to_png(report.reachability(error.reach)))
         except OSError:  # the disk is full: what is wrong with the config counts more
             raise error from None
         raise ConfigError(f"{error}; {picture} shows what it reaches") from None
@@ -151,7 +151,7 @@ def _resume(command: Train) -> Any:
             f"the run in {command.out} has seed {read_seed(command.out)}; leave --seed out to go on with it, or name "
             "another folder with --out"
         )
-    return _import_loop().resume(command.out, command.config)
+    return _import_loop().resume_run(command.out, command.config)
 
 
 def run_eval(command: Eval) -> None:
@@ -164,12 +164,12 @@ def run_eval(command: Eval) -> None:
             f"{command.run} was trained with env.reachable {trained.env.reachable} and env.motion "
             f"{trained.env.motion}; name a folder for the results of another evaluation with --out"
         )
-    with held(command.run):
+    with lock_folder(command.run):
         with console.status("reading the run"):
-            state = loop.resume(command.run, trained)
+            state = loop.resume_run(command.run, trained)
         loop.check_finished(command.run, state, trained)
         if command.out is not None:
-            claim(command.out)
+            make_new_folder(command.out)
         _evaluate(command.run, state, config, console, command.out)
 
 
@@ -196,9 +196,9 @@ def run_export(command: Export) -> None:
     from vsearch_jax.export import stablehlo
 
     config = read_config(command.run)
-    state = loop.resume(command.run, config)
+    state = loop.resume_run(command.run, config)
     loop.check_finished(command.run, state, config)
-    claim(command.out)
+    make_new_folder(command.out)
     stablehlo.export(command.out, state, config, command.seed)
     print(f"wrote {command.out}: encoder.stablehlo, policy.stablehlo, interface.json")
 
@@ -216,7 +216,7 @@ def run_reach(command: Reach) -> None:
         center_height=command.center_height,
         mesh_scale=command.mesh_scale,
     )
-    claim(command.out)
+    make_new_folder(command.out)
     with Console().status("mapping what the arm reaches"):
         message = draw_reach(command.out, scene, command.band, command.heights)
     print(message)
@@ -228,9 +228,9 @@ def run_video(command: Video) -> None:
     from vsearch_jax.film.video import make_video
 
     config = read_config(command.run)
-    state = loop.resume(command.run, config)
+    state = loop.resume_run(command.run, config)
     loop.check_finished(command.run, state, config)
-    claim_file(command.out, ".mp4")
+    check_new_file(command.out, ".mp4")
     with Console().status("filming a search"):
         message = make_video(command.out, state, config, command.motion, command.seed)
     print(message)

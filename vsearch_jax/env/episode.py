@@ -46,9 +46,9 @@ def episode_of(state: State) -> EpisodeState:
     return state.pipeline_state  # pyright: ignore[reportReturnType] # brax lets any pytree stand here
 
 
-def observe(episode: EpisodeState) -> Array:
+def build_obs(episode: EpisodeState) -> Array:
     """Returns the observation: code, target code, joints."""
-    return jnp.concatenate([episode.sight.code, episode.target.code, episode.sight.qpos])
+    return jnp.concatenate([episode.observation.code, episode.target.code, episode.observation.qpos])
 
 
 def pose_error(camera: Camera, target: Camera) -> tuple[Array, Array, Array]:

@@ -13,7 +13,7 @@ from jax import Array
 from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.config import Config
-from vsearch_jax.env.episode import check_band, episode_of, observe
+from vsearch_jax.env.episode import build_obs, check_band, episode_of
 from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.planning import (
     Motion,
@@ -34,10 +34,10 @@ from vsearch_jax.types import (
     EncoderState,
     EpisodeState,
     Image,
+    Observation,
     Path,
     PlanStatus,
     ReachabilityMap,
-    Sight,
     Trajectory,
     View,
 )
@@ -88,7 +88,7 @@ class ViewSearchEnv(Env):
             raise SceneError(f"object {self.config.scene.object!r} has no visible geom in the groups 0 to 2")
         self.fovy = math.radians(float(self.scene.mj_model.cam_fovy[self.scene.camera_id]))
         self.encoder = encoder if encoder is not None else encoders.init(jax.random.key(0), self.config)
-        self.reach = reach if reach is not None else jax.jit(self.map_reach)(jax.random.key(_REACH_SEED))
+        self.reach = reach if reach is not None else jax.jit(self.compute_reachability)(jax.random.key(_REACH_SEED))
         check_band(self.reach, self.config)
 
     @property
@@ -112,20 +112,20 @@ class ViewSearchEnv(Env):
         Args:
           rng: PRNG key (the name is brax's).
         """
-        sights = jax.vmap(self.random_sight)(jax.random.split(rng))
-        initial, target = (jax.tree.map(lambda x, i=i: x[i], sights) for i in range(2))
+        observations = jax.vmap(self.random_observation)(jax.random.split(rng))
+        initial, target = (jax.tree.map(lambda x, i=i: x[i], observations) for i in range(2))
         return self.start(initial, target)
 
-    def start(self, sight: Sight, target: Sight) -> State:
-        """Returns the start of the episode that looks for `target` from `sight`."""
-        episode = EpisodeState(sight=sight, target=target, num_steps=jnp.zeros((), jnp.int32))
+    def start(self, observation: Observation, target: Observation) -> State:
+        """Returns the start of the episode that looks for `target` from `observation`."""
+        episode = EpisodeState(observation=observation, target=target, num_steps=jnp.zeros((), jnp.int32))
         zero = jnp.zeros(())
         info = {"terminated": zero, "truncated": zero, "is_reachable": jnp.ones(())}
-        metrics = {"similarity": cosine_similarity(sight.code, target.code), "unreachable": zero}
+        metrics = {"similarity": cosine_similarity(observation.code, target.code), "unreachable": zero}
         metrics |= {"joint_travel": zero, "motion_time": zero}
         return State(
             pipeline_state=episode,  # pyright: ignore[reportArgumentType] # brax lets any pytree stand here
-            obs=observe(episode),
+            obs=build_obs(episode),
             reward=zero,
             done=zero,
             metrics=metrics,
@@ -135,63 +135,67 @@ class ViewSearchEnv(Env):
     def step(self, state: State, action: Array) -> State:
         """Returns the state after moving by `action` (f32[2], clipped to [-1, 1]); after the end nothing changes."""
         is_over = state.done > 0.0
-        moved, motion = self.go(self.commanded(state, action), episode_of(state).sight.qpos, is_over)
-        return jax.tree.map(lambda new, old: jnp.where(is_over, old, new), self.arrive(state, moved, motion), state)
+        moved, motion = self.move_to_view(
+            self.commanded_view(state, action), episode_of(state).observation.qpos, is_over
+        )
+        return jax.tree.map(
+            lambda new, old: jnp.where(is_over, old, new), self.apply_transition(state, moved, motion), state
+        )
 
-    def commanded(self, state: State, action: Array) -> View:
+    def commanded_view(self, state: State, action: Array) -> View:
         """Returns the view to which `action` (f32[2], clipped to [-1, 1]) leads, whether or not the arm reaches it."""
-        old = episode_of(state).sight.view
+        old = episode_of(state).observation.view
         delta = jnp.clip(action, -1.0, 1.0) * math.radians(self.config.env.action_scale_deg)
         return View(wrap_angle(old.azimuth + delta[0]), old.elevation + delta[1])
 
-    def arrive(self, state: State, moved: Sight, motion: Motion) -> State:
+    def apply_transition(self, state: State, moved: Observation, motion: Motion) -> State:
         """Returns the state after a step that led to `moved`, or nowhere where its motion was not found."""
         episode, task = episode_of(state), self.config.env
         is_reachable = motion.is_found
-        sight = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), moved, episode.sight)
-        similarity = cosine_similarity(sight.code, episode.target.code)
+        observation = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), moved, episode.observation)
+        similarity = cosine_similarity(observation.code, episode.target.code)
         is_found = is_reachable & (similarity >= task.threshold)
         reward = jnp.where(is_found, task.success_reward, similarity - 1.0)
         reward = jnp.where(is_reachable, reward, task.unreachable_reward)
         num_steps = episode.num_steps + 1
         terminated = is_found.astype(jnp.float32)
         truncated = (num_steps >= task.episode_length) & ~is_found
-        episode = EpisodeState(sight=sight, target=episode.target, num_steps=num_steps)
+        episode = EpisodeState(observation=observation, target=episode.target, num_steps=num_steps)
         reached = is_reachable.astype(jnp.float32)
         flags = {"terminated": terminated, "truncated": truncated.astype(jnp.float32), "is_reachable": reached}
         info = state.info | flags
         costs = {"joint_travel": motion.travel, "motion_time": motion.duration}
         metrics = state.metrics | {"similarity": similarity, "unreachable": 1.0 - reached} | costs
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
-            pipeline_state=episode, obs=observe(episode), reward=reward, done=terminated, metrics=metrics, info=info
+            pipeline_state=episode, obs=build_obs(episode), reward=reward, done=terminated, metrics=metrics, info=info
         )
 
-    def map_reach(self, key: Array) -> ReachabilityMap:
+    def compute_reachability(self, key: Array) -> ReachabilityMap:
         """Returns the reachability map of the config's arm, mount and object."""
         return reachability_map(self.arm, self.center, self.scene.radius, self.config.ik, key)
 
-    def solve(self, view: View, qpos: Array) -> tuple[Array, Array]:
+    def solve_joints(self, view: View, qpos: Array) -> tuple[Array, Array]:
         """Returns joints f32[nq] for `view`, of those found the nearest to `qpos`, and bool[] is_reachable."""
         result, is_reachable = solve_view(
             self.arm, self.reach, view, qpos, (self.center, self.scene.radius), self.config.ik
         )
         return result.qpos, is_reachable
 
-    def sample_pose(self, key: Array) -> tuple[View, Array]:
+    def random_pose(self, key: Array) -> tuple[View, Array]:
         """Returns a random reachable view, uniform in azimuth and elevation over the band, and joints f32[nq] for it.
 
         The arm's configuration varies: of the solutions found it is the one nearest to random joints.
         Where IK fails between the cells of the map, the view of the nearest reachable cell is returned.
         """
-        view, qpos, _ = self.settle(*self.random_view(key), jnp.bool_(False))
+        view, qpos, _ = self.resolve_view(*self.random_view(key), jnp.bool_(False))
         return view, qpos
 
-    def settle(self, view: View, qpos: Array, is_fixed: Array) -> tuple[View, Array, Array]:
+    def resolve_view(self, view: View, qpos: Array, is_fixed: Array) -> tuple[View, Array, Array]:
         """Returns a view, joints f32[nq] for it near `qpos` (f32[nq]), and bool[] whether they reach it.
 
         Where `view` is not reached, the map's nearest reachable cell takes its place, unless it `is_fixed` (bool[]).
         """
-        joints, is_reachable = self.solve(view, qpos)
+        joints, is_reachable = self.solve_joints(view, qpos)
         stays = is_reachable | is_fixed
         cell = nearest_cell(self.reach, view)
         near = (View(self.reach.azimuths[cell[0]], self.reach.elevations[cell[1]]), self.reach.qpos[cell])
@@ -216,47 +220,47 @@ class ViewSearchEnv(Env):
         joints = lower + (upper - lower) * numbers
         return self.arm.home.at[address].set(joints[address])
 
-    def random_sight(self, key: Array) -> Sight:
+    def random_observation(self, key: Array) -> Observation:
         """Returns what is seen from a random reachable view."""
-        view, qpos = self.sample_pose(key)
-        return self.see(view, qpos)
+        view, qpos = self.random_pose(key)
+        return self.observe_view(view, qpos)
 
-    def go(self, view: View, qpos: Array, is_over: Array | None = None) -> tuple[Sight, Motion]:
+    def move_to_view(self, view: View, qpos: Array, is_over: Array | None = None) -> tuple[Observation, Motion]:
         """Returns what is seen from `view`, and the motion there from joints `qpos` (f32[nq]).
 
         Where the search `is_over` (bool[]) or no joints are found the arm stays, since motions take long to compute;
         what is returned is then of no use.
         """
-        joints, is_reachable = self.solve(view, qpos)
+        joints, is_reachable = self.solve_joints(view, qpos)
         joints = jnp.where(is_reachable if is_over is None else is_reachable & ~is_over, joints, qpos)
         has_path = self.config.env.reachable == "path"
-        joints, motion = self.move(qpos, joints) if has_path else (joints, self.straight(qpos, joints))
+        joints, motion = self.move_joints(qpos, joints) if has_path else (joints, self.straight_motion(qpos, joints))
         is_found = is_reachable & motion.is_found
         costs = (jnp.where(is_found, cost, 0.0) for cost in (motion.travel, motion.duration))
-        return self.see(view, joints), Motion(is_found, *costs)
+        return self.observe_view(view, joints), Motion(is_found, *costs)
 
-    def straight(self, qpos: Array, goal: Array) -> Motion:
+    def straight_motion(self, qpos: Array, goal: Array) -> Motion:
         """Returns the straight motion from `qpos` to `goal` (f32[nq] each), whether or not something is in the way."""
         travel = jnp.linalg.norm((goal - qpos)[self.arm.chain.address])
         return Motion(jnp.bool_(True), travel, straight_duration(self.arm, qpos, goal, self.config.planning))
 
-    def move(self, qpos: Array, goal: Array) -> tuple[Array, Motion]:
+    def move_joints(self, qpos: Array, goal: Array) -> tuple[Array, Motion]:
         """Returns where the arm stands after it was to go from `qpos` to `goal` (f32[nq] each), and the planned motion.
 
         Without a path it stays. In dynamic motion it follows the path and ends where its dynamics lead.
         """
         is_kinematic = self.config.env.motion == "kinematic"
-        if self.arm.without_speed and is_kinematic:
+        if self.arm.joints_without_speed and is_kinematic:
             path = self._path(qpos, goal)
             return path.waypoints[-1], Motion(_is_found(path), path.length, jnp.float32(jnp.nan))
-        trajectory, motion = self.plan(qpos, goal)
+        trajectory, motion = self.plan_motion(qpos, goal)
         if is_kinematic:
             return trajectory.waypoints[-1], motion
         reached = execute(self.arm, self.scene.mjx_model, trajectory, self.config.planning).qpos
         # The limits are soft constraints: the next plan must be able to start from here.
         return jnp.clip(reached, self.arm.lower, self.arm.upper), motion
 
-    def plan(self, qpos: Array, goal: Array) -> tuple[Trajectory, Motion]:
+    def plan_motion(self, qpos: Array, goal: Array) -> tuple[Trajectory, Motion]:
         """Returns the motion from `qpos` to `goal` (f32[nq] each) and what it costs; the same one every time.
 
         Raises:
@@ -269,14 +273,14 @@ class ViewSearchEnv(Env):
     def _path(self, qpos: Array, goal: Array) -> Path:
         return rrt_connect(self.arm, jax.random.key(_PLANNING_SEED), qpos, goal, self.config.planning)
 
-    def see(self, view: View, qpos: Array) -> Sight:
+    def observe_view(self, view: View, qpos: Array) -> Observation:
         """Returns what the wrist camera sees with the arm at joints `qpos` (f32[nq]); `view` is only noted."""
-        camera, latent = self.raw_look(qpos)
-        return Sight(view=view, qpos=qpos, camera=camera, code=encoders.code_of(self.encoder, latent))
+        camera, latent = self.observe_latent(qpos)
+        return Observation(view=view, qpos=qpos, camera=camera, code=encoders.code_of(self.encoder, latent))
 
-    def raw_look(self, qpos: Array) -> tuple[Camera, Array]:
+    def observe_latent(self, qpos: Array) -> tuple[Camera, Array]:
         """Returns the wrist camera and the raw latent f32[Z] of its picture with the arm at joints `qpos` (f32[nq])."""
-        camera, image = self.picture(qpos)
+        camera, image = self.wrist_image(qpos)
         return camera, self.raw_latent(image)
 
     def raw_latent(self, image: Image) -> Array:
@@ -284,13 +288,13 @@ class ViewSearchEnv(Env):
         pixels = encoders.network_input(image, jnp.asarray(self.scene.object_geom_ids), self.config)
         return encoders.raw_latent(self.encoder.params, pixels, self.config)
 
-    def picture(self, qpos: Array) -> tuple[Camera, Image]:
+    def wrist_image(self, qpos: Array) -> tuple[Camera, Image]:
         """Returns the wrist camera and its picture with the arm at joints `qpos` (f32[nq])."""
-        data, camera = self.stand(qpos)
+        data, camera = self.forward(qpos)
         size = (self.config.scene.image_size, self.config.scene.image_size)
         return camera, render.render(self.render_scene, data, camera, size)
 
-    def stand(self, qpos: Array) -> tuple[Any, Camera]:
+    def forward(self, qpos: Array) -> tuple[Any, Camera]:
         """Returns MJX data of the arm at joints `qpos` (f32[nq]) and its wrist camera."""
         data = forward_kinematics(self.arm, qpos)
         return data, render.camera_from_pose(camera_pose(self.arm, data), self.fovy)

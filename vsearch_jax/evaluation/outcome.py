@@ -13,7 +13,7 @@ FALSE_POSITIVE_DEG = 10.0
 """A found view whose rotation is further than this from the target's is a false positive (thesis 3.6)."""
 
 
-def outcome(config: Config, result: SearchResult, camera: Camera, target: Camera) -> dict[str, Any]:
+def measure_outcome(config: Config, result: SearchResult, camera: Camera, target: Camera) -> dict[str, Any]:
     """Returns the measures of a search that ended at `camera`, when `target` was looked for."""
     rotation, frobenius, translation = pose_error(camera, target)
     is_success = result.score >= config.env.threshold

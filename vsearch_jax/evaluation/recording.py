@@ -13,7 +13,7 @@ from jax import Array
 
 from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv
-from vsearch_jax.evaluation.views import Asked, look_at, protocol_target
+from vsearch_jax.evaluation.views import ViewRequest, observe_request, protocol_target
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search import sac
 from vsearch_jax.types import TrainState, View
@@ -29,16 +29,16 @@ def record_search(state: TrainState, config: Config) -> dict[str, Array]:
     """
     env = ViewSearchEnv(config, state.encoder, state.reach)
     actor = first_actor(state)
-    start = begin(env, far_side(env, state.key))
+    start = start_episode(env, opposite_start(env, state.key))
 
     def step(now: Any) -> tuple[Any, None]:
         return env.step(now, sac.act(None, actor, now.obs, config.sac)), None
 
-    states, _ = follow(step, start, config.env.episode_length)
+    states, _ = roll_out(step, start, config.env.episode_length)
     return {
-        "images": jax.lax.map(lambda qpos: env.picture(qpos)[1].rgb, states.pipeline_state.sight.qpos),
+        "images": jax.lax.map(lambda qpos: env.wrist_image(qpos)[1].rgb, states.pipeline_state.observation.qpos),
         "similarity": states.metrics["similarity"],
-        "target": env.picture(start.pipeline_state.target.qpos)[1].rgb,
+        "target": env.wrist_image(start.pipeline_state.target.qpos)[1].rgb,
         "num_steps": states.pipeline_state.num_steps[-1],
     }
 
@@ -48,7 +48,7 @@ def first_actor(state: TrainState) -> Any:
     return jax.tree.map(lambda x: x[0], state.sac.actor)
 
 
-def far_side(env: ViewSearchEnv, key: Array) -> Asked:
+def opposite_start(env: ViewSearchEnv, key: Array) -> ViewRequest:
     """Returns, leading axis 2, an initial view beyond the object and the protocol's target.
 
     Args:
@@ -59,16 +59,16 @@ def far_side(env: ViewSearchEnv, key: Array) -> Asked:
     initial = View(wrap_angle(target.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))
     views = jax.tree.map(lambda *x: jnp.stack(x), initial, target)
     keys = jax.random.split(jax.random.fold_in(key, 2**31 - 2))
-    return Asked(views, jax.vmap(env.random_joints)(keys), jnp.ones(2, bool))
+    return ViewRequest(views, jax.vmap(env.random_joints)(keys), jnp.ones(2, bool))
 
 
-def begin(env: ViewSearchEnv, ends: Asked) -> Any:
+def start_episode(env: ViewSearchEnv, ends: ViewRequest) -> Any:
     """Returns the brax State at the start of the episode between `ends`, initial view and target on a leading axis."""
-    sights = jax.lax.map(functools.partial(look_at, env), ends)
-    return env.start(*(jax.tree.map(lambda x, i=i: x[i], sights) for i in range(2)))
+    observations = jax.lax.map(functools.partial(observe_request, env), ends)
+    return env.start(*(jax.tree.map(lambda x, i=i: x[i], observations) for i in range(2)))
 
 
-def follow(step: Callable[[Any], tuple[Any, Any]], start: Any, length: int) -> tuple[Any, Any]:
+def roll_out(step: Callable[[Any], tuple[Any, Any]], start: Any, length: int) -> tuple[Any, Any]:
     """Follows an episode to its end.
 
     Args:

@@ -9,7 +9,7 @@ from jax import Array
 
 from vsearch_jax.config import Config
 from vsearch_jax.geometry import angle_difference, cosine_similarity
-from vsearch_jax.types import Sight, View
+from vsearch_jax.types import Observation, View
 
 GRID_AZIMUTHS, GRID_ELEVATIONS = 144, 13
 """Views on which the lower bound of an episode's steps looks for the threshold: every 2.5 degrees."""
@@ -22,7 +22,7 @@ def band_grid(band: Array) -> View:
     return View(*(x.reshape(-1) for x in jnp.meshgrid(azimuths, elevations)))
 
 
-def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, config: Config) -> Array:
+def steps_lower_bound(initial: View, target: Observation, grid: Observation, band: Array, config: Config) -> Array:
     """Returns i32[], fewer steps than which no policy can need: a bound for one episode.
 
     A step changes azimuth and elevation by at most `action_scale_deg` each. The episode ends at the nearest view that
@@ -31,8 +31,8 @@ def steps_lower_bound(initial: View, target: Sight, grid: Sight, band: Array, co
 
     Args:
       initial: View of f32[] rad.
-      target: Sight of the target.
-      grid: Sight of f32[N, ...], of the views of `band_grid`.
+      target: Observation of the target.
+      grid: Observation of f32[N, ...], of the views of `band_grid`.
       band: f32[2] rad, the elevations that `grid` spans.
       config: the run's.
     """

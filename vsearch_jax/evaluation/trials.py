@@ -13,9 +13,9 @@ from vsearch_jax.env import ViewSearchEnv
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
-from vsearch_jax.search.common import is_running, taken, to_result
-from vsearch_jax.types import Camera, SearchResult, Sight, View
-from vsearch_jax.xla.batching import map_batched
+from vsearch_jax.search.common import is_running, taken_images, to_result
+from vsearch_jax.types import Camera, Observation, SearchResult, View
+from vsearch_jax.xla.batching import map_in_batches
 
 
 class _Trial(NamedTuple):
@@ -35,7 +35,7 @@ class _Trial(NamedTuple):
 
 
 def search_trials(
-    keys: Array, env: ViewSearchEnv, methods: tuple[Method, ...], starts: tuple[Sight, Array], target: Sight
+    keys: Array, env: ViewSearchEnv, methods: tuple[Method, ...], starts: tuple[Observation, Array], target: Observation
 ) -> list[tuple[SearchResult, dict[str, Array], Camera]]:
     """Runs every searcher from each of `starts`, one searcher after the other.
 
@@ -45,8 +45,8 @@ def search_trials(
       keys: PRNG key of each searcher.
       env: the task.
       methods: the searchers' parts.
-      starts: Sight of f32[N, ...] of the initial views and their scores f32[N].
-      target: Sight of the target.
+      starts: Observation of f32[N, ...] of the initial views and their scores f32[N].
+      target: Observation of the target.
 
     Returns:
       For each searcher its results, what its motions cost (`joint_travel` f32 rad, `motion_time` f32 s, `num_plans`
@@ -59,7 +59,7 @@ def search_trials(
     def searcher(xs: tuple[Array, Array]) -> _Trial:
         number, key = xs
         trial = functools.partial(_trial, env, methods, number, target)
-        return map_batched(trial, (jax.random.split(key, starts[1].shape[0]), starts), batch_size)
+        return map_in_batches(trial, (jax.random.split(key, starts[1].shape[0]), starts), batch_size)
 
     trials = jax.lax.map(searcher, (jnp.arange(len(methods)), keys))
     results = []
@@ -77,8 +77,8 @@ def _trial(
     env: ViewSearchEnv,
     methods: tuple[Method, ...],
     number: Array,
-    target: Sight,
-    item: tuple[Array, tuple[Sight, Array]],
+    target: Observation,
+    item: tuple[Array, tuple[Observation, Array]],
 ) -> _Trial:
     key, (start, score) = item
     args = SearchArgs(
@@ -87,7 +87,7 @@ def _trial(
     states = tuple(method.start(args, score) for method in methods)
     body = functools.partial(_generation, env, methods, (number, key), target, args)
 
-    goes_on = functools.partial(_goes_on, methods, number, args)
+    goes_on = functools.partial(_is_trial_running, methods, number, args)
     return jax.lax.while_loop(goes_on, body, _Trial(states, start.camera, start.qpos, jnp.zeros(2)))
 
 
@@ -95,7 +95,7 @@ def _generation(
     env: ViewSearchEnv,
     methods: tuple[Method, ...],
     searcher: tuple[Array, Array],
-    target: Sight,
+    target: Observation,
     args: SearchArgs,
     trial: _Trial,
 ) -> _Trial:
@@ -117,57 +117,67 @@ def _generation(
     views, states = jax.lax.switch(number, [functools.partial(ask, i) for i in numbers], trial.states)
     # Those that only fill up the generation are not.
     is_asked = jnp.arange(num_views) < jnp.asarray([method.num_views for method in methods])[number]
-    is_over = ~_goes_on(methods, number, args, trial)
-    sights, motions, scores = _go_round(env, (trial.qpos, is_over), (views, is_asked), target, args.threshold)
+    is_over = ~_is_trial_running(methods, number, args, trial)
+    observations, motions, scores = _observe_generation(
+        env, (trial.qpos, is_over), (views, is_asked), target, args.threshold
+    )
     # Nor is anything after the view that ends the search.
-    is_moved = motions.is_found & taken(scores, args.threshold) & is_asked
-    qpos, costs = _follow(env, trial, sights.qpos, motions._replace(is_found=is_moved))
+    is_moved = motions.is_found & taken_images(scores, args.threshold) & is_asked
+    qpos, costs = _add_motion_costs(env, trial, observations.qpos, motions._replace(is_found=is_moved))
     states, best = jax.lax.switch(number, [functools.partial(tell, i) for i in numbers], states, views, scores)
-    camera = jax.tree.map(lambda new, old: jnp.where(best >= 0, new[best], old), sights.camera, trial.camera)
+    camera = jax.tree.map(lambda new, old: jnp.where(best >= 0, new[best], old), observations.camera, trial.camera)
     return _Trial(states, camera, qpos, costs)
 
 
-def _goes_on(methods: tuple[Method, ...], number: Array, args: SearchArgs, trial: _Trial) -> Array:
+def _is_trial_running(methods: tuple[Method, ...], number: Array, args: SearchArgs, trial: _Trial) -> Array:
     """Returns bool[]: searcher `number` is not done with the trial."""
     records = [method.record(state) for method, state in zip(methods, trial.states, strict=True)]
     return jnp.stack([is_running(record, args.threshold) for record in records])[number]
 
 
-def _go_round(
-    env: ViewSearchEnv, now: tuple[Array, Array], asked: tuple[View, Array], target: Sight, threshold: Array
-) -> tuple[Sight, Motion, Array]:
+def _observe_generation(
+    env: ViewSearchEnv, now: tuple[Array, Array], asked: tuple[View, Array], target: Observation, threshold: Array
+) -> tuple[Observation, Motion, Array]:
     """Looks at a generation of views, one after the other where paths are asked for.
 
     Args:
       env: the task.
       now: joints f32[nq] where the arm stands, and bool[], whether the search is over.
       asked: View of f32[N] rad, and bool[N], whether it is to be looked at: if not, the arm need not move.
-      target: Sight of the target.
+      target: Observation of the target.
       threshold: f32[], the score at which the search ends, and with it the motions.
 
     Returns:
       What is seen, the motions, and the scores f32[N].
     """
 
-    def look(here: Array, is_over: Array, asked: tuple[View, Array]) -> tuple[Sight, Motion, Array]:
+    def look(here: Array, is_over: Array, asked: tuple[View, Array]) -> tuple[Observation, Motion, Array]:
         view, is_asked = asked
-        sight, motion = env.go(view, here, is_over | ~is_asked)
-        return sight, motion, jnp.where(motion.is_found, cosine_similarity(sight.code, target.code), -jnp.inf)
+        observation, motion = env.move_to_view(view, here, is_over | ~is_asked)
+        return (
+            observation,
+            motion,
+            jnp.where(motion.is_found, cosine_similarity(observation.code, target.code), -jnp.inf),
+        )
 
     if env.config.env.reachable == "ik":
         return jax.vmap(look, in_axes=(None, None, 0))(*now, asked)
 
     def go_on(
         now: tuple[Array, Array], asked: tuple[View, Array]
-    ) -> tuple[tuple[Array, Array], tuple[Sight, Motion, Array]]:
+    ) -> tuple[tuple[Array, Array], tuple[Observation, Motion, Array]]:
         here, is_over = now
-        sight, motion, score = look(here, is_over, asked)
-        return (jnp.where(motion.is_found, sight.qpos, here), is_over | (score >= threshold)), (sight, motion, score)
+        observation, motion, score = look(here, is_over, asked)
+        return (jnp.where(motion.is_found, observation.qpos, here), is_over | (score >= threshold)), (
+            observation,
+            motion,
+            score,
+        )
 
     return jax.lax.scan(go_on, now, asked)[1]
 
 
-def _follow(env: ViewSearchEnv, trial: _Trial, joints: Array, motions: Motion) -> tuple[Array, Array]:
+def _add_motion_costs(env: ViewSearchEnv, trial: _Trial, joints: Array, motions: Motion) -> tuple[Array, Array]:
     """Returns where the arm stands after the motions to `joints` (f32[N, nq]) that are found, and all costs so far.
 
     Without paths the views of a generation are looked at from one place, all at once, so here each way is measured
@@ -177,7 +187,7 @@ def _follow(env: ViewSearchEnv, trial: _Trial, joints: Array, motions: Motion) -
     def add(done: tuple[Array, Array], step: tuple[Array, Motion]) -> tuple[tuple[Array, Array], None]:
         (here, costs), (there, motion) = done, step
         if env.config.env.reachable == "ik":
-            motion = env.straight(here, there)._replace(is_found=motion.is_found)
+            motion = env.straight_motion(here, there)._replace(is_found=motion.is_found)
         cost = jnp.stack([motion.travel, motion.duration])
         return (jnp.where(motion.is_found, there, here), costs + jnp.where(motion.is_found, cost, 0.0)), None
 

@@ -10,7 +10,7 @@ from jax import Array
 from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv
 from vsearch_jax.geometry import wrap_angle
-from vsearch_jax.types import Sight, View
+from vsearch_jax.types import Observation, View
 
 
 def initial_views(config: Config, band: Array) -> View:
@@ -30,7 +30,7 @@ def protocol_target(config: Config) -> View:
     return View(wrap_angle(jnp.deg2rad(settings.target_azimuth_deg)), jnp.deg2rad(settings.target_elevation_deg))
 
 
-class Asked(NamedTuple):
+class ViewRequest(NamedTuple):
     """A view to look at.
 
     Attributes:
@@ -44,12 +44,12 @@ class Asked(NamedTuple):
     is_fixed: Array
 
 
-def look_at(env: ViewSearchEnv, asked: Asked) -> Sight:
+def observe_request(env: ViewSearchEnv, asked: ViewRequest) -> Observation:
     """Returns what is seen from a view, or from the nearest one of the map if any will do.
 
     The code of a fixed view that is not reached is 0, which matches nothing.
     """
-    view, qpos, is_reached = env.settle(*asked)
-    sight = env.see(view, qpos)
-    code = jnp.where(is_reached, sight.code, 0.0)
-    return sight.replace(code=code)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
+    view, qpos, is_reached = env.resolve_view(*asked)
+    observation = env.observe_view(view, qpos)
+    code = jnp.where(is_reached, observation.code, 0.0)
+    return observation.replace(code=code)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it

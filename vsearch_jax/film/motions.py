@@ -14,14 +14,14 @@ from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv, episode_of
-from vsearch_jax.evaluation.recording import begin, far_side, first_actor, follow
-from vsearch_jax.evaluation.views import Asked
+from vsearch_jax.evaluation.recording import first_actor, opposite_start, roll_out, start_episode
+from vsearch_jax.evaluation.views import ViewRequest
 from vsearch_jax.geometry import cosine_similarity
-from vsearch_jax.planning import duration, sample
+from vsearch_jax.planning import duration, state_at
 from vsearch_jax.planning.execution import pass_through
 from vsearch_jax.search import sac
-from vsearch_jax.types import Camera, Sight, TrainState, Trajectory, View
-from vsearch_jax.xla.batching import map_batched
+from vsearch_jax.types import Camera, Observation, TrainState, Trajectory, View
+from vsearch_jax.xla.batching import map_in_batches
 
 FPS = 25
 """Frames of a second."""
@@ -40,7 +40,7 @@ class FilmedSearch(NamedTuple):
 
     Attributes:
       start: f32[nq] rad or m, joints at the initial view.
-      target: Sight of the view that is looked for.
+      target: Observation of the view that is looked for.
       joints: f32[T, F, nq] rad or m, in each motion at 1, 2, ... F frames since it began; where it ended from there on.
       seconds: f32[T], duration of each motion; 0 where the arm stayed.
       similarity: f32[T + 1], of the pictures taken, that of the initial view first.
@@ -50,7 +50,7 @@ class FilmedSearch(NamedTuple):
     """
 
     start: Array
-    target: Sight
+    target: Observation
     joints: Array
     seconds: Array
     similarity: Array
@@ -91,21 +91,21 @@ def film_search(state: TrainState, key: Array | None, config: Config) -> FilmedS
     """
     env = ViewSearchEnv(config, state.encoder, state.reach)
     actor = first_actor(state)
-    start = begin(env, far_side(env, state.key) if key is None else _random_ends(env, key))
+    start = start_episode(env, opposite_start(env, state.key) if key is None else _random_ends(env, key))
 
     def step(now: Any) -> tuple[Any, tuple[Array, Array]]:
-        here = episode_of(now).sight.qpos
-        view = env.commanded(now, sac.act(None, actor, now.obs, config.sac))
-        goal, is_solved = env.solve(view, here)
-        trajectory, motion = env.plan(here, goal)
+        here = episode_of(now).observation.qpos
+        view = env.commanded_view(now, sac.act(None, actor, now.obs, config.sac))
+        goal, is_solved = env.solve_joints(view, here)
+        trajectory, motion = env.plan_motion(here, goal)
         motion = motion._replace(is_found=motion.is_found & is_solved)
         joints, seconds = _drive(env, trajectory, motion.is_found & (now.done < 0.5))
-        return env.arrive(now, env.see(view, joints[-1]), motion), (joints, seconds)
+        return env.apply_transition(now, env.observe_view(view, joints[-1]), motion), (joints, seconds)
 
-    states, (joints, seconds) = follow(step, start, config.env.episode_length)
+    states, (joints, seconds) = roll_out(step, start, config.env.episode_length)
     first, last = episode_of(start), jax.tree.map(lambda x: x[-1], states)
     return FilmedSearch(
-        start=first.sight.qpos,
+        start=first.observation.qpos,
         target=first.target,
         joints=joints,
         seconds=seconds,
@@ -116,9 +116,9 @@ def film_search(state: TrainState, key: Array | None, config: Config) -> FilmedS
     )
 
 
-def _random_ends(env: ViewSearchEnv, key: Array) -> Asked:
+def _random_ends(env: ViewSearchEnv, key: Array) -> ViewRequest:
     views, joints = jax.vmap(env.random_view)(jax.random.split(key))
-    return Asked(views, joints, jnp.zeros(2, bool))
+    return ViewRequest(views, joints, jnp.zeros(2, bool))
 
 
 def _drive(env: ViewSearchEnv, trajectory: Trajectory, is_moved: Array) -> tuple[Array, Array]:
@@ -131,7 +131,7 @@ def _drive(env: ViewSearchEnv, trajectory: Trajectory, is_moved: Array) -> tuple
     if config.env.motion == "dynamic":
         joints, seconds = pass_through(arm, env.scene.mjx_model, trajectory, config.planning, times)
     else:
-        joints = jax.vmap(lambda time: sample(arm, trajectory, time)[0])(times)
+        joints = jax.vmap(lambda time: state_at(arm, trajectory, time)[0])(times)
         seconds = duration(trajectory)
     joints = jnp.where(is_moved, joints, trajectory.waypoints[:1])
     return jnp.clip(joints, arm.lower[None], arm.upper[None]), jnp.where(is_moved, seconds, 0.0)
@@ -139,14 +139,14 @@ def _drive(env: ViewSearchEnv, trajectory: Trajectory, is_moved: Array) -> tuple
 
 @functools.partial(jax.jit, static_argnames=("config", "size"))
 def look_along(
-    state: TrainState, qpos: Array, target: Sight, overview: Camera, config: Config, size: tuple[int, int]
+    state: TrainState, qpos: Array, target: Observation, overview: Camera, config: Config, size: tuple[int, int]
 ) -> Frames:
     """Returns what is seen with the arm at each of `qpos`.
 
     Args:
       state: a trained state.
       qpos: f32[N, nq] rad or m.
-      target: Sight of the view that is looked for.
+      target: Observation of the view that is looked for.
       overview: Camera beside the arm.
       config: the run's.
       size: height and width in pixels of the overview.
@@ -155,15 +155,15 @@ def look_along(
     surroundings = dataclasses.replace(env.render_scene, background=jnp.asarray(_SKY))
 
     def look(joints: Array) -> Frames:
-        data, _ = env.stand(joints)
-        camera, image = env.picture(joints)
+        data, _ = env.forward(joints)
+        camera, image = env.wrist_image(joints)
         code = encoders.code_of(env.encoder, env.raw_latent(image))
         away = camera.position - env.center
         view = View(jnp.arctan2(away[1], away[0]), jnp.arctan2(away[2], jnp.hypot(away[0], away[1])))
         scenery = render.supersample(surroundings, data, overview, size, _SAMPLES).rgb
         return Frames(_bytes(scenery), _bytes(image.rgb), cosine_similarity(code, target.code), view)
 
-    return map_batched(look, qpos, _BATCH)
+    return map_in_batches(look, qpos, _BATCH)
 
 
 def _bytes(rgb: Array) -> Array:

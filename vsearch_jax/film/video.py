@@ -15,8 +15,8 @@ from vsearch_jax.film.motions import FPS, MOST_SECONDS, FilmedSearch, Frames, fi
 from vsearch_jax.film.overview import overview_camera
 from vsearch_jax.film.page import FilmPage, Moment
 from vsearch_jax.film.writer import FilmError, find_ffmpeg, write_film
-from vsearch_jax.runs.folder import MOST_SEED
-from vsearch_jax.runs.interrupts import in_thread
+from vsearch_jax.runs.folder import MAX_SEED
+from vsearch_jax.runs.interrupts import call_interruptibly
 from vsearch_jax.scene import build_scene
 from vsearch_jax.types import TrainState
 
@@ -69,12 +69,12 @@ def make_video(
       PlanningError, SceneError: the arm's model has no speed limits, or no actuators for dynamic motion.
       FilmError: a motion is too long for a film, or the encoder stopped, as it does on a full disk.
     """
-    if seed is not None and not 0 <= seed <= MOST_SEED:
-        raise ConfigError(f"seed is {seed}; allowed: 0 to {MOST_SEED}")
+    if seed is not None and not 0 <= seed <= MAX_SEED:
+        raise ConfigError(f"seed is {seed}; allowed: 0 to {MAX_SEED}")
     find_ffmpeg()  # now, not when the search is done
     config = dataclasses.replace(config, env=dataclasses.replace(config.env, reachable="path", motion=motion))
     key = None if seed is None else jax.random.key(seed)
-    search: FilmedSearch = jax.tree.map(np.asarray, in_thread(film_search, state, key, config))
+    search: FilmedSearch = jax.tree.map(np.asarray, call_interruptibly(film_search, state, key, config))
     longest = float(search.seconds.max())
     if longest > MOST_SECONDS:
         raise FilmError(
@@ -144,7 +144,7 @@ def _pictures(
     def looks() -> Iterator[Frames]:
         for first in range(0, len(qpos), _CHUNK):
             index = np.minimum(np.arange(first, first + _CHUNK), len(qpos) - 1)
-            seen = in_thread(look_along, state, qpos[index], search.target, camera, config, size)
+            seen = call_interruptibly(look_along, state, qpos[index], search.target, camera, config, size)
             frames = jax.tree.map(np.asarray, seen)
             for place in range(min(_CHUNK, len(qpos) - first)):
                 yield jax.tree.map(lambda x, i=place: x[i], frames)

@@ -10,7 +10,7 @@ from typing import IO
 
 import numpy as np
 
-from vsearch_jax.runs.atomic import replacing
+from vsearch_jax.runs.atomic import replace_file
 
 
 class FilmError(ValueError):
@@ -47,7 +47,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int, size: tuple[i
     # faststart: a browser can begin before it has all of the file.
     encoded = "-c:v libx264 -pix_fmt yuv420p -crf 18 -movflags +faststart"
     options = f"-y -loglevel error {raw} {encoded}".split()
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         # Not by imageio: its writer forks, which may deadlock beside JAX's threads, and does not tell of a film that
         # could not be finished.
         command = [find_ffmpeg(), *options, str(temporary)]

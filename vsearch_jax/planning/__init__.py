@@ -10,7 +10,7 @@ from vsearch_jax.planning.trajectory import (
     PlanningError,
     check_speeds,
     duration,
-    sample,
+    state_at,
     straight_duration,
     time_path,
 )
@@ -27,9 +27,9 @@ __all__ = [
     "reachability_map",
     "rrt",
     "rrt_connect",
-    "sample",
     "solve_view",
     "start_limits",
+    "state_at",
     "straight_duration",
     "time_path",
 ]

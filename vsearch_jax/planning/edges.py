@@ -14,7 +14,7 @@ from vsearch_jax.planning.proofs import Bounds, Sample, is_free_between, look, m
 from vsearch_jax.robot import collision
 from vsearch_jax.robot.arm import Arm
 from vsearch_jax.robot.collision import Axes
-from vsearch_jax.xla.batching import batch_last, widened
+from vsearch_jax.xla.batching import append_axes, batch_axis_last
 
 # A step is as long as if the next sample were nearly as far from everything as this one, and the speed the same. Where
 # that fails, a shorter one is tried, then one that is safe wherever the next sample touches nothing.
@@ -77,7 +77,7 @@ def reached(edge: Edge) -> Array:
 
 def advance(arm: Arm, edge: Edge, qpos: Array, config: PlanningConfig, count: int = 1) -> Edge:
     """Returns the edge after `count` more probes or samples; `qpos` (f32[nq]) holds the joints that stay."""
-    advance_all = batch_last(functools.partial(_advance, config.resolution, count))
+    advance_all = batch_axis_last(functools.partial(_advance, config.resolution, count))
     return advance_all(arm, (edge, qpos))
 
 
@@ -119,7 +119,7 @@ def _advance_once(arm: Arm, qpos: Array, bounds: Bounds, resolution: float, edge
 
 def _step(pairs: collision.Pairs, edge: Edge, bounds: Bounds, resolution: float) -> Array:
     """Returns f32[], the share of the edge to the next sample."""
-    wide = functools.partial(widened, batch=edge.done.ndim)
+    wide = functools.partial(append_axes, batch=edge.done.ndim)
     gap, boldness = edge.sample.gap, jnp.asarray(BOLD)[jnp.minimum(edge.num_tries, LAST_TRY)][None]
     extra = jnp.where(edge.num_tries == 0, resolution, 0.0)[None]
     by_levers = (boldness * gap + extra) / jnp.maximum(bounds.rate, 1e-9)

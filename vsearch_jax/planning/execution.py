@@ -13,7 +13,7 @@ from jax import Array
 from mujoco import mjx
 
 from vsearch_jax.config import PlanningConfig
-from vsearch_jax.planning import check_speeds, duration, sample
+from vsearch_jax.planning import check_speeds, duration, state_at
 from vsearch_jax.robot.arm import Arm
 from vsearch_jax.scene import Scene, SceneError
 from vsearch_jax.types import Trajectory
@@ -115,7 +115,7 @@ def _follow(arm: Arm, model: mjx.Model, trajectory: Trajectory, data: mjx.Data) 
     gain, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
     lead = damping / jnp.maximum(gain, 1e-9)
     in_qpos = jnp.asarray(model.jnt_qposadr)[jnp.asarray(model.actuator_trnid[:, 0])]
-    joints, velocity = sample(arm, trajectory, data.time)
+    joints, velocity = state_at(arm, trajectory, data.time)
     command = joints[in_qpos] + lead * velocity[in_qpos]
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # mjx promotes freely
         return mjx.step(model, data.replace(ctrl=command))

@@ -88,7 +88,7 @@ def ik(arm: Arm, T_world_camera: SE3, qpos: Array, config: IKConfig) -> IKResult
         limits, but the status says so and the result does not count as converged.
       config: iterations, damping, tolerances, number of starts, and whether the camera may roll.
     """
-    solve = lane_pool.flattened(functools.partial(_solve_batch, config))
+    solve = lane_pool.flatten_vmap(functools.partial(_solve_batch, config))
     poses = (T_world_camera.translation()[None], T_world_camera.rotation().as_matrix()[None])
     result = solve(arm, (*poses, qpos[None]))
     return jax.tree.map(lambda leaf: leaf[0], result)
@@ -128,14 +128,14 @@ def _clear(arm: Arm, joints: Array, finite: Array, is_open: Array) -> Array:
         return jnp.where(free, 1, 0)
 
     job = lane_pool.Job(
-        begin=lambda _, state, is_new: jnp.where(is_new, -1, state),
+        reset=lambda _, state, is_new: jnp.where(is_new, -1, state),
         step=step,
         is_done=lambda state: state >= 0,
-        finish=lambda _, state: state > 0,
+        result=lambda _, state: state > 0,
         has_stragglers=False,
     )
     blank, states = jnp.zeros(is_open.shape, bool), jnp.zeros(min(MOST_LANES, is_open.shape[0]), jnp.int32)
-    return lane_pool.run(job, (joints, finite), lane_pool.in_order(is_open), states, blank)
+    return lane_pool.run(job, (joints, finite), lane_pool.queue_where(is_open), states, blank)
 
 
 def _run(arm: Arm, config: IKConfig, problems: _Problem, is_open: Array, results: _Solution) -> _Solution:
@@ -148,7 +148,7 @@ def _run(arm: Arm, config: IKConfig, problems: _Problem, is_open: Array, results
     num_lanes = min(MOST_LANES, is_open.shape[0])
     first = jax.tree.map(lambda leaf: leaf[:num_lanes], problems)
     states = jax.vmap(functools.partial(_fresh, config))(first)
-    return lane_pool.run(job, problems, lane_pool.in_order(is_open), states, results)
+    return lane_pool.run(job, problems, lane_pool.queue_where(is_open), states, results)
 
 
 def _fresh(config: IKConfig, problem: _Problem) -> _State:

@@ -10,7 +10,7 @@ them free where, for every pair, their distances add up to more than that way. T
 Above the table only the height counts, which lies between those of the ends of the chord. Far from everything a few
 samples do for a whole edge.
 
-All functions take arrays with a batch axis more at the end, too; see `batches.batch_last`.
+All functions take arrays with a batch axis more at the end, too; see `batches.batch_axis_last`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from jax import Array
 from vsearch_jax.robot import collision, kinematics
 from vsearch_jax.robot.arm import Arm
 from vsearch_jax.robot.collision import Axes, Pairs, primitives
-from vsearch_jax.xla.batching import widened
-from vsearch_jax.xla.materialize import materialize, unknown_zero
+from vsearch_jax.xla.batching import append_axes
+from vsearch_jax.xla.materialize import materialize, runtime_zero
 
 # m, of positions in float32.
 ROUNDING = 1e-5
@@ -57,19 +57,19 @@ class Bounds(NamedTuple):
 
 def look(arm: Arm, qpos: Array) -> Sample:
     """Returns where the arm is at `qpos` (f32[nq])."""
-    zero = unknown_zero(qpos)
+    zero = runtime_zero(qpos)
     # Else what follows computes this anew, the axes for every pair.
     rotations, positions, _, _ = kinematics.frames(arm.joints, materialize(qpos[arm.joints.address], zero))
     pairs = arm.planning_pairs
-    axes = materialize(collision.axes_from_frames(pairs, rotations, positions), zero)
-    gap = collision.gaps_between(pairs, axes, arm.table_height)
+    axes = materialize(collision.capsule_axes(pairs, rotations, positions), zero)
+    gap = collision.distances_from_axes(pairs, axes, arm.table_height)
     margin = jnp.where(pairs.part == collision.TABLE, arm.table_clearance, 0.0)
-    return Sample(gap - widened(margin, qpos.ndim - 1), axes)
+    return Sample(gap - append_axes(margin, qpos.ndim - 1), axes)
 
 
 def motion_bounds(pairs: Pairs, change: Array) -> Bounds:
     """Returns the bounds of the edge on which the joints of the chain change by `change` (f32[J] rad or m)."""
-    wide = functools.partial(widened, batch=change.ndim - 1)
+    wide = functools.partial(append_axes, batch=change.ndim - 1)
     turns = jnp.abs(change)
     before = jnp.cumsum(turns, axis=0) - turns
     # Joint k, turning by w_k, gives a point the speed w_k r_k; it turns that itself, every joint before it twice.
@@ -79,10 +79,13 @@ def motion_bounds(pairs: Pairs, change: Array) -> Bounds:
 
 def ways(before: Axes, after: Axes) -> tuple[Array, Array]:
     """Returns how far in m the capsules have moved, f32[C], and how far downward, f32[C]."""
-    middle, end = primitives.minus(after.center, before.center), primitives.minus(after.half_axis, before.half_axis)
+    middle, end = (
+        primitives.subtract(after.center, before.center),
+        primitives.subtract(after.half_axis, before.half_axis),
+    )
     one = jnp.ones_like(middle[0])
-    moves = [primitives.along(middle, sign * one, end) for sign in (1.0, -1.0)]
-    way = jnp.maximum(*(primitives.norm(move) for move in moves))
+    moves = [primitives.add_scaled(middle, sign * one, end) for sign in (1.0, -1.0)]
+    way = jnp.maximum(*(primitives.length(move) for move in moves))
     return way, jnp.maximum(-jnp.minimum(*(move[2] for move in moves)), 0.0)
 
 
@@ -96,7 +99,7 @@ def is_free_between(pairs: Pairs, ends: tuple[Sample, Sample], step: Array, boun
       bounds: of the edge.
       way: f32[C] m, how far the capsules have moved from one to the other.
     """
-    wide = functools.partial(widened, batch=step.ndim)
+    wide = functools.partial(append_axes, batch=step.ndim)
     gap, step = ends[0].gap + ends[1].gap, step[None]
     by_levers = gap >= bounds.rate * step + ROUNDING
     stray = (bounds.bend * step * step)[pairs.mover]

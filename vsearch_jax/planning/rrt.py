@@ -51,7 +51,7 @@ def rrt(arm: Arm, key: Array, start: Array, goal: Array, config: PlanningConfig)
 
 
 def _plan(is_bidirectional: bool, arm: Arm, key: Array, start: Array, goal: Array, config: PlanningConfig) -> Path:
-    plan = lane_pool.flattened(functools.partial(_plan_batch, is_bidirectional, config))
+    plan = lane_pool.flatten_vmap(functools.partial(_plan_batch, is_bidirectional, config))
     result = plan(arm, (key[None], start[None], goal[None]))
     return jax.tree.map(lambda leaf: leaf[0], result)
 
@@ -109,7 +109,7 @@ def _straight(arm: Arm, config: PlanningConfig, problems: Problem, is_open: Arra
     )
     origin = jnp.zeros(problems.start.shape[1])
     states = _copies(edge_between(arm, origin, origin), is_open)
-    return lane_pool.run(job, problems, lane_pool.in_order(is_open), states, jnp.zeros(is_open.shape[0], bool))
+    return lane_pool.run(job, problems, lane_pool.queue_where(is_open), states, jnp.zeros(is_open.shape[0], bool))
 
 
 def _grow(
@@ -127,7 +127,9 @@ def _grow(
         lambda state: state.is_done,
         finish,
     )
-    return lane_pool.run(job, problems, lane_pool.in_order(is_open), _copies(trees.empty(arm, config), is_open), blank)
+    return lane_pool.run(
+        job, problems, lane_pool.queue_where(is_open), _copies(trees.empty(arm, config), is_open), blank
+    )
 
 
 def _shorten(arm: Arm, config: PlanningConfig, paths: Crooked, is_open: Array) -> Array:
@@ -139,7 +141,7 @@ def _shorten(arm: Arm, config: PlanningConfig, paths: Crooked, is_open: Array) -
         has_stragglers=False,
     )
     states = _copies(shortcuts.empty(arm, config), is_open)
-    return lane_pool.run(job, paths, lane_pool.in_order(is_open), states, paths.waypoints)
+    return lane_pool.run(job, paths, lane_pool.queue_where(is_open), states, paths.waypoints)
 
 
 def _copies(state: Any, problems: Array) -> Any:

@@ -85,8 +85,8 @@ def check_speeds(arm: Arm) -> None:
     Raises:
       PlanningError: the model gives none for a joint.
     """
-    if arm.without_speed:
-        names = ", ".join(arm.without_speed)
+    if arm.joints_without_speed:
+        names = ", ".join(arm.joints_without_speed)
         raise PlanningError(f"no speed limit for joint {names}: give the joint's `user` in rad/s (or m/s), above 0")
 
 
@@ -111,7 +111,7 @@ def duration(trajectory: Trajectory) -> Array:
     return trajectory.times[-1]
 
 
-def sample(arm: Arm, trajectory: Trajectory, time: Array) -> tuple[Array, Array]:
+def state_at(arm: Arm, trajectory: Trajectory, time: Array) -> tuple[Array, Array]:
     """Returns joints f32[nq] (rad or m) and their velocity f32[nq] at `time` (f32[] s); at rest before and after."""
     times, sizes = trajectory.times, trajectory.sizes
     inside = jnp.clip(time, 0.0, times[-1])

@@ -28,8 +28,8 @@ from vsearch_jax.render.scene import RenderError, RenderScene
 from vsearch_jax.render.texture import lookup
 from vsearch_jax.render.tiling import Tiling
 from vsearch_jax.types import Camera, Image
-from vsearch_jax.xla.batching import map_batched
-from vsearch_jax.xla.materialize import materialize, unknown_zero
+from vsearch_jax.xla.batching import map_in_batches
+from vsearch_jax.xla.materialize import materialize, runtime_zero
 
 # Height and width of the part of an image that is drawn at a time on a CPU: the some forty planes of a batch of such
 # parts stay in its cache, and a part meets fewer geoms than the whole.
@@ -82,7 +82,7 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
     part = _CPU_TILE if jax.default_backend() == "cpu" else size
     tiling = Tiling(size, (min(part[0], size[0]), min(part[1], size[1])))
     frames, lights = _frames(scene, data, camera), light_poses(scene, data, camera)
-    zero = unknown_zero(frames.origin)
+    zero = runtime_zero(frames.origin)
     pixels = pinhole(camera, size)
     # Else the tangent and the products behind these would be computed anew in every pixel.
     rotation, rays = camera.rotation, pixel_rays(pixels, size)
@@ -106,7 +106,7 @@ def render(scene: RenderScene, data: Any, camera: Camera, size: tuple[int, int])
 def render_batch(scene: RenderScene, data: Any, cameras: Camera, size: tuple[int, int], *, batch_size: int) -> Image:
     """Returns what each of `cameras` sees, drawn `batch_size` at a time, so that any number fits into memory.
 
-    Where poses or the scene differ from image to image, `batches.map_batched` over a function of yours does the same.
+    Where poses or the scene differ from image to image, `batches.map_in_batches` over a function of yours does the same.
 
     Args:
       scene: RenderScene.
@@ -123,7 +123,7 @@ def render_batch(scene: RenderScene, data: Any, cameras: Camera, size: tuple[int
     """
     if batch_size < 1:
         raise RenderError(f"batch_size is {batch_size}; allowed: 1 or more")
-    return map_batched(lambda camera: render(scene, data, camera, size), cameras, batch_size)
+    return map_in_batches(lambda camera: render(scene, data, camera, size), cameras, batch_size)
 
 
 def silhouette(image: Image, geom_ids: tuple[int, ...]) -> Array:

@@ -1,7 +1,7 @@
 """Results, table, figures and page of a run, each with the thesis's figures beside ours."""
 
 from vsearch_jax.report.figures import mount_heights, reachability, search_strip
-from vsearch_jax.report.page import draw, png, write, write_report
+from vsearch_jax.report.page import draw, to_png, write, write_report
 from vsearch_jax.report.summary import SEARCHERS, results
 from vsearch_jax.report.table import print_table
 
@@ -9,11 +9,11 @@ __all__ = [
     "SEARCHERS",
     "draw",
     "mount_heights",
-    "png",
     "print_table",
     "reachability",
     "results",
     "search_strip",
+    "to_png",
     "write",
     "write_report",
 ]

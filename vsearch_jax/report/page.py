@@ -88,16 +88,16 @@ def write(folder: Path, summary: Mapping[str, Any], pictures: Mapping[str, Figur
     """
     text = json.dumps(summary, indent=2, allow_nan=False) + "\n"  # before anything is written over
     (folder / "figures").mkdir(exist_ok=True)
-    images = {name: png(picture) for name, picture in pictures.items()}
+    images = {name: to_png(picture) for name, picture in pictures.items()}
     for name, image in images.items():
-        atomic.write(folder / "figures" / f"{name}.png", image)
-    atomic.write(folder / "report.html", _page(folder.absolute().name, summary, images, config))
+        atomic.write_atomically(folder / "figures" / f"{name}.png", image)
+    atomic.write_atomically(folder / "report.html", _page(folder.absolute().name, summary, images, config))
     # The last one: where it is, the report is whole.
-    atomic.write(folder / "results.json", text)
+    atomic.write_atomically(folder / "results.json", text)
 
 
 @styled
-def png(picture: Figure) -> bytes:
+def to_png(picture: Figure) -> bytes:
     """Returns the picture as a PNG file."""
     buffer = io.BytesIO()
     picture.savefig(buffer, format="png")

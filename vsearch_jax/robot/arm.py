@@ -40,7 +40,7 @@ class Arm:
       table_clearance: f32[] m, least distance from the table.
       data: mjx.Data into which `forward_kinematics` writes.
       camera_id: the wrist camera.
-      without_speed: names of the joints that move the camera and have no speed limit.
+      joints_without_speed: names of the joints that move the camera and have no speed limit.
     """
 
     joints: Joints
@@ -60,7 +60,7 @@ class Arm:
     table_clearance: Array
     data: mjx.Data
     camera_id: int = flax.struct.field(pytree_node=False)
-    without_speed: tuple[str, ...] = flax.struct.field(pytree_node=False)
+    joints_without_speed: tuple[str, ...] = flax.struct.field(pytree_node=False)
 
 
 @flax.struct.dataclass
@@ -122,7 +122,9 @@ def build_arm(scene: Scene) -> Arm:
         table_clearance=jnp.float32(scene.table_clearance),
         data=mjx.make_data(scene.mjx_model),
         camera_id=camera,
-        without_speed=tuple(model.joint(j).name for j in scene.joint_ids if np.isnan(speed[model.jnt_qposadr[j]])),
+        joints_without_speed=tuple(
+            model.joint(j).name for j in scene.joint_ids if np.isnan(speed[model.jnt_qposadr[j]])
+        ),
     )
 
 
@@ -203,13 +205,13 @@ def clearance(arm: Arm, data: mjx.Data) -> Clearance:
     is a mesh; the distance is then on the safe side. Neighbours and excluded pairs are left out as MuJoCo does.
     """
     pairs = arm.pairs
-    gap = collision.gaps(pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
+    gap = collision.pair_distances(pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
     parts = (collision.TABLE, collision.OBJECT, collision.SELF, collision.OBSTACLE)
-    table, target, own, obstacles = (collision.least(pairs, gap, part) for part in parts)
+    table, target, own, obstacles = (collision.min_distance(pairs, gap, part) for part in parts)
     return Clearance(table=table, object=target, self=own, obstacles=obstacles)
 
 
 def is_free(arm: Arm, data: mjx.Data) -> Array:
     """Returns bool[]: nothing touches, and the table's clearance is kept."""
-    gap = collision.gaps(arm.pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
+    gap = collision.pair_distances(arm.pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
     return jnp.all(gap > jnp.where(arm.pairs.part == collision.TABLE, arm.table_clearance, 0.0))

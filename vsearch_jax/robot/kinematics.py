@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from vsearch_jax.xla.batching import widened
+from vsearch_jax.xla.batching import append_axes
 
 
 @flax.struct.dataclass
@@ -81,7 +81,7 @@ def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
       joints: the J joints.
       values: f32[J] rad or m, of the joints; they may have a batch axis more at the end, then the results have it too.
     """
-    count, wide = joints.parent.shape[0], functools.partial(widened, batch=values.ndim - 1)
+    count, wide = joints.parent.shape[0], functools.partial(append_axes, batch=values.ndim - 1)
     axis, is_slide, rotation = wide(joints.axis), wide(joints.is_slide), wide(joints.rotation)
     change = values - wide(joints.reference)
     angle, offset = jnp.where(is_slide, 0.0, change), jnp.where(is_slide, change, 0.0)
@@ -113,7 +113,7 @@ def _axis_rotations(axis: Array, angle: Array) -> Array:
     cross = jnp.stack([jnp.stack(row, axis=1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=1)
     outer = axis[:, :, None] * axis[:, None, :]
     cosine, sine = jnp.cos(angle)[:, None, None], jnp.sin(angle)[:, None, None]
-    return cosine * widened(jnp.eye(3)[None], angle.ndim - 1) + sine * cross + (1.0 - cosine) * outer
+    return cosine * append_axes(jnp.eye(3)[None], angle.ndim - 1) + sine * cross + (1.0 - cosine) * outer
 
 
 def place(things: Placement, rotations: Array, positions: Array) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vsearch_jax.config import Config, ConfigError
-from vsearch_jax.runs.atomic import write
+from vsearch_jax.runs.atomic import write_atomically
 
 try:
     import fcntl
@@ -25,7 +25,7 @@ METRICS = "metrics.jsonl"
 EVENTS = "tensorboard"
 
 
-MOST_SEED = 2**32 - 1
+MAX_SEED = 2**32 - 1
 """Seeds are numbers of 32 bits: jax would cut a larger one, and two seeds would be one."""
 
 
@@ -33,7 +33,7 @@ class RunError(ValueError):
     """A run's folder is in the way, missing or incomplete; the message says which and what to do."""
 
 
-def claim(folder: Path) -> None:
+def make_new_folder(folder: Path) -> None:
     """Makes the folder `folder` for new files; an empty one that exists will do.
 
     Raises:
@@ -46,7 +46,7 @@ def claim(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
 
 
-def claim_file(path: Path, suffix: str) -> None:
+def check_new_file(path: Path, suffix: str) -> None:
     """Checks that nothing is at `path`, where a new file is to be made, and makes its folder.
 
     Raises:
@@ -60,13 +60,13 @@ def claim_file(path: Path, suffix: str) -> None:
 
 
 @contextlib.contextmanager
-def claimed(run: Path) -> Iterator[None]:
+def new_run_folder(run: Path) -> Iterator[None]:
     """Makes the folder `run` for a new run, and takes away what the block that is to start the run wrote if it fails.
 
     Raises:
-      RunError: see `claim`.
+      RunError: see `make_new_folder`.
     """
-    claim(run)
+    make_new_folder(run)
     try:
         yield
     except BaseException:
@@ -85,7 +85,7 @@ def _remove(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def held(run: Path) -> Iterator[None]:
+def lock_folder(run: Path) -> Iterator[None]:
     """Keeps other processes out of the folder `run`, if there is one, for as long as the block or this process lives.
 
     Raises:
@@ -111,7 +111,7 @@ def held(run: Path) -> Iterator[None]:
 
 def write_config(run: Path, config: Config, seed: int) -> None:
     """Writes `config.json`, the run's seed in it; the other half are `read_config` and `read_seed`."""
-    write(run / CONFIG, json.dumps({"seed": seed, **config.to_dict()}, indent=2) + "\n")
+    write_atomically(run / CONFIG, json.dumps({"seed": seed, **config.to_dict()}, indent=2) + "\n")
 
 
 def read_config(run: Path) -> Config:
@@ -131,8 +131,8 @@ def read_config(run: Path) -> Config:
 def read_seed(run: Path) -> int:
     """Returns the seed of the run in the folder `run`; raises as `read_config`."""
     seed = _read(run).get("seed")
-    if not isinstance(seed, int) or not 0 <= seed <= MOST_SEED:
-        raise ConfigError(f"{run / CONFIG}: seed is {seed!r}, no whole number from 0 to {MOST_SEED}; {_REPAIR}")
+    if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
+        raise ConfigError(f"{run / CONFIG}: seed is {seed!r}, no whole number from 0 to {MAX_SEED}; {_REPAIR}")
     return seed
 
 

@@ -18,17 +18,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from vsearch_jax.runs import checkpoint
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.evaluation import check_target, evaluate, record_search
+from vsearch_jax.runs import checkpoint
+from vsearch_jax.runs.folder import MAX_SEED, RunError, new_run_folder, read_config, read_seed, write_config
+from vsearch_jax.runs.interrupts import OnInterrupt, call_interruptibly, stop_on_signal
 from vsearch_jax.runs.metrics_log import STAGES, MetricsLog, read_metrics
-from vsearch_jax.runs.folder import MOST_SEED, RunError, claimed, read_config, read_seed, write_config
-from vsearch_jax.runs.interrupts import OnInterrupt, in_thread, stop_requested
 from vsearch_jax.training import init, train
 from vsearch_jax.types import ReachabilityMap, TrainState
 
 
-def start(run: Path, config: Config, seed: int) -> TrainState:
+def start_run(run: Path, config: Config, seed: int) -> TrainState:
     """Makes the folder `run` and returns the state at the start, saved there as the checkpoint of step 0.
 
     If that fails the folder is left empty.
@@ -38,17 +38,17 @@ def start(run: Path, config: Config, seed: int) -> TrainState:
       ConfigError, SceneError: the config or the seed can't be run.
       OSError: the disk is full or not writable.
     """
-    if not 0 <= seed <= MOST_SEED:
-        raise ConfigError(f"seed is {seed}; allowed: 0 to {MOST_SEED}")
-    with claimed(run):
-        state = in_thread(init, jax.random.key(seed), config)
+    if not 0 <= seed <= MAX_SEED:
+        raise ConfigError(f"seed is {seed}; allowed: 0 to {MAX_SEED}")
+    with new_run_folder(run):
+        state = call_interruptibly(init, jax.random.key(seed), config)
         check_target(state.reach, config)  # now, not when the training is done
         write_config(run, config, seed)
         checkpoint.save(run, state, config)
     return state
 
 
-def resume(run: Path, config: Config) -> TrainState:
+def resume_run(run: Path, config: Config) -> TrainState:
     """Returns the state of the last checkpoint in the folder `run`.
 
     Raises:
@@ -68,7 +68,8 @@ def resume(run: Path, config: Config) -> TrainState:
 OnChunk = Callable[[int, float, Sequence[Mapping[str, Any]]], None]
 """Takes iterations done, the chunk's wall time in s and its lines of metrics.jsonl."""
 
-def finish_training(
+
+def train_to_end(
     run: Path, state: TrainState, config: Config, on_chunk: OnChunk, on_interrupt: OnInterrupt = lambda: None
 ) -> TrainState:
     """Trains from `state` to the end of the run, saving after each chunk.
@@ -77,7 +78,7 @@ def finish_training(
 
     Args:
       run: the run's folder.
-      state: from `start` or `resume`; donated.
+      state: from `start_run` or `resume_run`; donated.
       config: the run's config.
       on_chunk: called after each chunk is saved.
       on_interrupt: called at the first interrupt.
@@ -87,7 +88,7 @@ def finish_training(
       RunError: the training diverged, or metrics.jsonl is damaged.
       OSError: the disk is full or not writable; the last checkpoint stays.
     """
-    with stop_requested(on_interrupt) as is_stopping:
+    with stop_on_signal(on_interrupt) as is_stopping:
         return _train_chunks(run, state, config, on_chunk, is_stopping)
 
 
@@ -98,7 +99,7 @@ def _train_chunks(
     log = MetricsLog(run, step)
     while step < config.num_iterations:
         began = time.perf_counter()
-        state, metrics = in_thread(train, state, config)
+        state, metrics = call_interruptibly(train, state, config)
         seconds = time.perf_counter() - began
         new_step = int(state.step)
         # The last chunk may be shorter than its arrays.
@@ -164,12 +165,12 @@ def evaluate_run(run: Path, state: TrainState, config: Config) -> Evaluated:
     lines, seed = read_metrics(run), read_seed(run)
     release_memory()  # of the compiled training, some GiB
     began = time.perf_counter()
-    arrays = in_thread(evaluate, state, config)
+    arrays = call_interruptibly(evaluate, state, config)
     wall_seconds: dict[str, float] = {
         stage: sum(line["seconds"] for line in lines if line["stage"] == stage) for stage in STAGES
     }
     wall_seconds["evaluation"] = time.perf_counter() - began
-    search = jax.tree.map(np.asarray, in_thread(record_search, state, config))
+    search = jax.tree.map(np.asarray, call_interruptibly(record_search, state, config))
     return Evaluated(arrays, search, state.reach, lines, wall_seconds, seed)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from vsearch_jax.runs.atomic import write
+from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.folder import EVENTS, METRICS, RunError
 
 STAGES = ("encoder", "policy")
@@ -56,7 +56,7 @@ class MetricsLog:
         """Opens the logs in the folder `run` to go on at iteration `step`; what they hold of later ones is dropped."""
         self.lines = [line for line in read_metrics(run) if line["iteration"] < step]
         self._path = run / METRICS
-        write(self._path, "".join(json.dumps(line) + "\n" for line in self.lines))
+        write_atomically(self._path, "".join(json.dumps(line) + "\n" for line in self.lines))
         self._events = SummaryWriter(str(run / EVENTS), purge_step=step)
 
     def append(self, metrics: Mapping[str, np.ndarray], first: int, seconds: float) -> None:

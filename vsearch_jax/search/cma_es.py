@@ -22,7 +22,7 @@ from jax import Array
 
 from vsearch_jax.config import CMAESConfig
 from vsearch_jax.geometry import wrap_angle
-from vsearch_jax.search.common import Method, Record, ScoreFn, SearchArgs, add_generation, run, start_record
+from vsearch_jax.search.common import Method, Record, ScoreFn, SearchArgs, add_generation, run_search, start_record
 from vsearch_jax.types import SearchResult, View
 
 # One unit of the search space is a quarter turn of azimuth and half the band's height of elevation.
@@ -77,7 +77,7 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: CMAESConfig)
     Returns:
       SearchResult with best_scores f32[config.max_generations].
     """
-    return run(key, score_fn, args, method(config))
+    return run_search(key, score_fn, args, method(config))
 
 
 def method(config: CMAESConfig) -> Method:

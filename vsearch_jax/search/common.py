@@ -77,7 +77,7 @@ class Method(NamedTuple):
     num_views: int
 
 
-def run(key: Array, score_fn: ScoreFn, args: SearchArgs, method: Method) -> SearchResult:
+def run_search(key: Array, score_fn: ScoreFn, args: SearchArgs, method: Method) -> SearchResult:
     """Returns what `method` finds; `score_fn` is vmapped over the views of a generation."""
     state = method.start(args, score_fn(args.initial, args.task))
     body = functools.partial(_generation, key, score_fn, args, method)
@@ -104,7 +104,7 @@ def start_record(view: View, score: Array, max_generations: int) -> Record:
     )
 
 
-def taken(scores: Array, threshold: Array) -> Array:
+def taken_images(scores: Array, threshold: Array) -> Array:
     """Returns bool[N], which of a generation's images are taken: none after the first whose score meets `threshold`."""
     is_hit = (scores >= threshold).astype(jnp.int32)
     return jnp.cumsum(is_hit) - is_hit == 0
@@ -116,7 +116,7 @@ def add_generation(record: Record, views: View, scores: Array, threshold: Array)
     The images are taken one by one and the search ends with the first that meets `threshold` (f32[]); those after it
     are not taken, so they neither count nor enter the best.
     """
-    is_taken = taken(scores, threshold)
+    is_taken = taken_images(scores, threshold)
     taken_scores = jnp.where(is_taken, scores, -jnp.inf)
     best = jnp.argmax(taken_scores)
     is_better = taken_scores[best] > record.score

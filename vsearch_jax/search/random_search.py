@@ -17,7 +17,7 @@ from vsearch_jax.search.common import (
     SearchArgs,
     add_generation,
     fold_into_band,
-    run,
+    run_search,
     start_record,
 )
 from vsearch_jax.types import SearchResult, View
@@ -39,7 +39,7 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearch
     Returns:
       SearchResult with best_scores f32[config.max_epochs].
     """
-    return run(key, score_fn, args, method(config))
+    return run_search(key, score_fn, args, method(config))
 
 
 def method(config: RandomSearchConfig) -> Method:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 
-def map_batched(function: Any, xs: Any, batch_size: int) -> Any:
+def map_in_batches(function: Any, xs: Any, batch_size: int) -> Any:
     """Returns `function` over the leading axis of `xs`, `batch_size` items at a time.
 
     Unlike `jax.lax.map` it compiles `function` once also where batches do not come out even: the last item is repeated.
@@ -22,7 +22,7 @@ def map_batched(function: Any, xs: Any, batch_size: int) -> Any:
     return jax.tree.map(lambda x: x[:count], results)
 
 
-def batch_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+def batch_axis_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """Makes `vmap` of a function put the batch axis last, where XLA for CPU vectorises over it and gathers whole rows.
 
     Args:
@@ -51,6 +51,6 @@ def batch_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]
     return batched
 
 
-def widened(leaf: Array, batch: int) -> Array:
+def append_axes(leaf: Array, batch: int) -> Array:
     """Returns `leaf` with `batch` axes of length one more at the end, to go with arrays that have the batch there."""
     return leaf.reshape(*leaf.shape, *[1] * batch)

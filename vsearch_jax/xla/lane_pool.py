@@ -23,19 +23,19 @@ class Job(NamedTuple):
     """What a lane does; functions of one item.
 
     Attributes:
-      begin: (problem, state, is_new bool[]) -> state: of a new problem where `is_new`, else unchanged. It gets the old
+      reset: (problem, state, is_new bool[]) -> state: of a new problem where `is_new`, else unchanged. It gets the old
         state, so that large buffers need not be cleared.
       step: (problem, state) -> state; a state that is done must come back unchanged.
       is_done: state -> bool[].
-      finish: (problem, state) -> result.
+      result: (problem, state) -> result.
       has_stragglers: some problems take many more steps than others. Then the last few go on alone, which
         is compiled apart and so takes longer to compile.
     """
 
-    begin: Callable[[Any, Any, Array], Any]
+    reset: Callable[[Any, Any, Array], Any]
     step: Callable[[Any, Any], Any]
     is_done: Callable[[Any], Array]
-    finish: Callable[[Any, Any], Any]
+    result: Callable[[Any, Any], Any]
     has_stragglers: bool = True
 
 
@@ -56,7 +56,7 @@ def run(job: Job, problems: Any, order: tuple[Array, Array], states: Any, result
       problems: pytree, leading axis N.
       order: i32[N], which problem comes when, and i32[], how many of them are worked on.
       states: pytree, leading axis L: the lanes; their content is overwritten.
-      results: pytree, leading axis N, as `job.finish` returns them.
+      results: pytree, leading axis N, as `job.result` returns them.
     """
     num_problems, num_lanes = order[0].shape[0], jax.tree.leaves(states)[0].shape[0]
     state = _Run(states, jnp.full(num_lanes, num_problems, jnp.int32), jnp.int32(0), results)
@@ -91,7 +91,7 @@ def _loop(job: Job, problems: Any, order: tuple[Array, Array], state: _Run, few:
         states = jax.lax.while_loop(goes_on, lambda states: jax.vmap(job.step)(current, states), state.states)
         is_done = jax.vmap(job.is_done)(states) & is_held
         row = jnp.where(is_done, state.held, idle)
-        found = jax.vmap(job.finish)(current, states)
+        found = jax.vmap(job.result)(current, states)
         results = jax.tree.map(lambda old, new: old.at[row].set(new, mode="drop"), state.results, found)
         return state._replace(states=states, held=jnp.where(is_done, idle, state.held), results=results)
 
@@ -104,11 +104,11 @@ def _refill(job: Job, problems: Any, order: tuple[Array, Array], state: _Run) ->
     rank = state.head + jnp.cumsum(state.held >= idle) - 1
     is_new = (state.held >= idle) & (rank < count)
     held = jnp.where(is_new, queue[jnp.clip(rank, 0, idle - 1)], state.held)
-    states = jax.vmap(job.begin)(_rows(problems, held), state.states, is_new)
+    states = jax.vmap(job.reset)(_rows(problems, held), state.states, is_new)
     return state._replace(states=states, held=held, head=state.head + jnp.sum(is_new, dtype=jnp.int32))
 
 
-def in_order(is_wanted: Array) -> tuple[Array, Array]:
+def queue_where(is_wanted: Array) -> tuple[Array, Array]:
     """Returns the `order` that works on the problems where `is_wanted` (bool[N]), first to last."""
     return jnp.argsort(~is_wanted).astype(jnp.int32), jnp.sum(is_wanted, dtype=jnp.int32)
 
@@ -117,7 +117,7 @@ def _rows(problems: Any, index: Array) -> Any:
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(index, leaf.shape[0] - 1)], problems)
 
 
-def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
+def flatten_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
     """Makes `vmap` of a batched function one larger batch instead of a loop in a loop.
 
     Args:

@@ -27,7 +27,7 @@ def materialize(tree: Any, zero: Array) -> Any:
 
     Args:
       tree: pytree of arrays of numbers.
-      zero: i32[], always 0, in a way that the compiler cannot know; see `unknown_zero`.
+      zero: i32[], always 0, in a way that the compiler cannot know; see `runtime_zero`.
     """
     return jax.lax.while_loop(_is_left, _change, (jnp.zeros_like(zero), zero, tree))[2]
 
@@ -37,7 +37,7 @@ def _materialize_jvp(primals: tuple[Any, Array], tangents: tuple[Any, Any]) -> t
     return materialize(*primals), tangents[0]
 
 
-def unknown_zero(lengths: Array) -> Array:
+def runtime_zero(lengths: Array) -> Array:
     """Returns i32[] 0, computed from `lengths` (any shape).
 
     They must be known at run time only: what the compiler can compute is no secret to it.

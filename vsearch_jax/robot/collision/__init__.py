@@ -1,6 +1,6 @@
 """Signed distances between the arm's capsules and what they must not touch."""
 
-from vsearch_jax.robot.collision.distances import Axes, axes_from_frames, gaps, gaps_between, least
+from vsearch_jax.robot.collision.distances import Axes, capsule_axes, distances_from_axes, min_distance, pair_distances
 from vsearch_jax.robot.collision.pairs import (
     NEVER_NEAR,
     OBJECT,
@@ -23,9 +23,9 @@ __all__ = [
     "Geoms",
     "Pairs",
     "Solids",
-    "axes_from_frames",
     "build_pairs",
-    "gaps",
-    "gaps_between",
-    "least",
+    "capsule_axes",
+    "distances_from_axes",
+    "min_distance",
+    "pair_distances",
 ]

@@ -18,7 +18,7 @@ from vsearch_jax.robot.collision import primitives
 from vsearch_jax.robot.collision.pairs import Pairs, Solids
 from vsearch_jax.robot.collision.primitives import Vector
 from vsearch_jax.robot.kinematics import rotate_each
-from vsearch_jax.xla.batching import widened
+from vsearch_jax.xla.batching import append_axes
 
 
 class Axes(NamedTuple):
@@ -28,7 +28,7 @@ class Axes(NamedTuple):
     half_axis: Vector
 
 
-def gaps(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> Array:
+def pair_distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> Array:
     """Returns the signed distance f32[N] in m of each pair, from the poses of the geoms.
 
     A capsule whose axis passes through a box or a cylinder is minus its radius away, however deep it is.
@@ -40,33 +40,33 @@ def gaps(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) 
       table_height: f32[] m, world z.
     """
     rotation = geom_xmat[pairs.geom]
-    middle = primitives.turned(rotation, primitives.planes(pairs.center))
-    center = primitives.along(middle, jnp.ones_like(pairs.radius), primitives.planes(geom_xpos[pairs.geom]))
-    return gaps_between(
-        pairs, Axes(center, primitives.turned(rotation, primitives.planes(pairs.half_axis))), table_height
+    middle = primitives.rotate(rotation, primitives.coordinates(pairs.center))
+    center = primitives.add_scaled(middle, jnp.ones_like(pairs.radius), primitives.coordinates(geom_xpos[pairs.geom]))
+    return distances_from_axes(
+        pairs, Axes(center, primitives.rotate(rotation, primitives.coordinates(pairs.half_axis))), table_height
     )
 
 
-def axes_from_frames(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
+def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
     """Returns the axes of the capsules from the frames of the joints; see `kinematics.frames`, also for batches."""
     frame = pairs.placement.frame
-    wide = functools.partial(widened, batch=positions.ndim - 2)
+    wide = functools.partial(append_axes, batch=positions.ndim - 2)
     rotation = rotations[frame]
     center = positions[frame] + rotate_each(rotation, wide(pairs.placement.position))
     half_axis = rotate_each(rotation, wide(pairs.frame_half_axis))
     return Axes((center[:, 0], center[:, 1], center[:, 2]), (half_axis[:, 0], half_axis[:, 1], half_axis[:, 2]))
 
 
-def gaps_between(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
-    """Returns what `gaps` does, from the axes of the capsules; these may have a batch axis more at the end."""
+def distances_from_axes(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
+    """Returns what `pair_distances` does, from the axes of the capsules; these may have a batch axis more at the end."""
     center, half_axis = axes
-    wide = functools.partial(widened, batch=center[0].ndim - 1)
+    wide = functools.partial(append_axes, batch=center[0].ndim - 1)
     radius = wide(pairs.radius)
     lowest = center[2] - jnp.abs(half_axis[2]) - radius
     first, second = pairs.first, pairs.second
     apart = primitives.segment_distance(*(_rows(v, i) for i in (first, second) for v in (center, half_axis)))
     solids = (pairs.boxes, pairs.cylinders, pairs.ellipsoids)
-    sizes = [jax.tree.map(wide, primitives.planes(kind.size)) for kind in solids]
+    sizes = [jax.tree.map(wide, primitives.coordinates(kind.size)) for kind in solids]
     local = [_in_frames(kind, axes, wide) for kind in solids]
     from_solids = (
         primitives.segment_box_distance(*local[0], sizes[0]),
@@ -84,9 +84,9 @@ def gaps_between(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
 
 def _in_frames(solids: Solids, axes: Axes, wide: Callable[[Array], Array]) -> Axes:
     """Returns the axes of the capsules in the frames of the solids."""
-    columns = jax.tree.map(wide, [primitives.planes(solids.rotation[:, :, i]) for i in range(3)])
-    offset = primitives.minus(
-        _rows(axes.center, solids.capsule), jax.tree.map(wide, primitives.planes(solids.position))
+    columns = jax.tree.map(wide, [primitives.coordinates(solids.rotation[:, :, i]) for i in range(3)])
+    offset = primitives.subtract(
+        _rows(axes.center, solids.capsule), jax.tree.map(wide, primitives.coordinates(solids.position))
     )
     half_axis = _rows(axes.half_axis, solids.capsule)
     first, second, third = columns
@@ -97,7 +97,7 @@ def _in_frames(solids: Solids, axes: Axes, wide: Callable[[Array], Array]) -> Ax
     return Axes(turned(offset), turned(half_axis))
 
 
-def least(pairs: Pairs, gap: Array, part: int) -> Array:
+def min_distance(pairs: Pairs, gap: Array, part: int) -> Array:
     """Returns the least of the distances `gap` (f32[N]) from one part, f32[] m; +inf where there is nothing."""
     return jnp.min(jnp.where(pairs.part == part, gap, jnp.inf), initial=jnp.inf)
 

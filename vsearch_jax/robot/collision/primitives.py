@@ -25,7 +25,7 @@ TANGENT_ITERATIONS = 6
 NEWTON_ITERATIONS = 6
 
 
-def planes(vectors: Array) -> Vector:
+def coordinates(vectors: Array) -> Vector:
     """Returns the coordinates of `vectors` (f32[..., 3])."""
     return vectors[..., 0], vectors[..., 1], vectors[..., 2]
 
@@ -35,23 +35,23 @@ def dot(a: Vector, b: Vector) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def turned(rotation: Array, vector: Vector) -> Vector:
+def rotate(rotation: Array, vector: Vector) -> Vector:
     """Returns `vector` turned by `rotation` (f32[..., 3, 3])."""
-    x, y, z = (dot(planes(rotation[..., row, :]), vector) for row in range(3))
+    x, y, z = (dot(coordinates(rotation[..., row, :]), vector) for row in range(3))
     return x, y, z
 
 
-def minus(a: Vector, b: Vector) -> Vector:
+def subtract(a: Vector, b: Vector) -> Vector:
     """Returns a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-def along(a: Vector, s: Array, b: Vector) -> Vector:
+def add_scaled(a: Vector, s: Array, b: Vector) -> Vector:
     """Returns a + s b."""
     return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
 
 
-def norm(vector: Vector) -> Array:
+def length(vector: Vector) -> Array:
     """Returns the length; its gradient is finite at zero."""
     return jnp.sqrt(jnp.maximum(dot(vector, vector), 1e-24))
 
@@ -62,7 +62,7 @@ def segment_distance(center_a: Vector, half_a: Vector, center_b: Vector, half_b:
     A segment may be a point; parallel segments are no exception (Ericson, Real-Time Collision Detection, 5.1.9).
     """
     tiny = 1e-12
-    offset = minus(center_a, center_b)
+    offset = subtract(center_a, center_b)
     aa, bb, ab = dot(half_a, half_a), dot(half_b, half_b), dot(half_a, half_b)
     oa, ob = dot(half_a, offset), dot(half_b, offset)
     determinant = aa * bb - ab * ab
@@ -72,7 +72,7 @@ def segment_distance(center_a: Vector, half_a: Vector, center_b: Vector, half_b:
     t = jnp.clip((ab * s + ob) / jnp.maximum(bb, tiny), -1.0, 1.0)
     s = jnp.clip((ab * t - oa) / jnp.maximum(aa, tiny), -1.0, 1.0)
     t = jnp.clip((ab * s + ob) / jnp.maximum(bb, tiny), -1.0, 1.0)
-    return norm(along(along(offset, s, half_a), -t, half_b))
+    return length(add_scaled(add_scaled(offset, s, half_a), -t, half_b))
 
 
 def segment_box_distance(center: Vector, half_axis: Vector, size: Vector) -> Array:
@@ -88,7 +88,7 @@ def segment_box_distance(center: Vector, half_axis: Vector, size: Vector) -> Arr
     """
 
     def outside(s: Array) -> Vector:
-        x, y, z = (x - jnp.clip(x, -h, h) for x, h in zip(along(center, s, half_axis), size, strict=True))
+        x, y, z = (x - jnp.clip(x, -h, h) for x, h in zip(add_scaled(center, s, half_axis), size, strict=True))
         return x, y, z
 
     low, high = jnp.full_like(center[0], -1.0), jnp.ones_like(center[0])
@@ -105,7 +105,7 @@ def segment_box_distance(center: Vector, half_axis: Vector, size: Vector) -> Arr
     share = -slope_low / jnp.maximum(slope_high - slope_low, 1e-20)
     s = low + (high - low) * jnp.clip(share, 0.0, 1.0)
     s = jnp.where(slope_first >= 0.0, -1.0, jnp.where(slope_last <= 0.0, 1.0, s))
-    return norm(outside(s))
+    return length(outside(s))
 
 
 def _larger(a: Array, b: Array, is_taken: Array) -> Array:
@@ -128,7 +128,7 @@ def segment_cylinder_distance(center: Vector, half_axis: Vector, radius: Array, 
     """
 
     def at(s: Array) -> tuple[Array, Array, Array]:
-        x, y, z = along(center, s, half_axis)
+        x, y, z = add_scaled(center, s, half_axis)
         radial = jnp.sqrt(jnp.maximum(x * x + y * y, 1e-24))
         beside, above = jnp.maximum(radial - radius, 0.0), z - jnp.clip(z, -half_length, half_length)
         distance = jnp.sqrt(jnp.maximum(beside * beside + above * above, 1e-24))
@@ -169,14 +169,14 @@ def ellipsoid_distance(point: Vector, size: Vector) -> Array:
         slope = -2.0 * sum(ratio / (t + rr) for ratio, rr in zip(ratios, squared, strict=True))
         t = t - (sum(ratios) - 1.0) / slope
     x, y, z = (x - rr * x / (t + rr) for x, rr in zip(p, squared, strict=True))
-    return jnp.sign(t) * norm((x, y, z))
+    return jnp.sign(t) * length((x, y, z))
 
 
 def least_along(distance: Callable[[Vector], Array], center: Vector, half_axis: Vector) -> Array:
     """Returns the least of a convex `distance` over the segments, by golden section."""
 
     def at(s: Array) -> Array:
-        return distance(along(center, s, half_axis))
+        return distance(add_scaled(center, s, half_axis))
 
     if center[0].size == 0:
         return jnp.zeros_like(center[0])

@@ -1,9 +1,9 @@
 """Soft actor-critic with goal relabelling: networks, update, replay and the roll-out of the policy."""
 
 from vsearch_jax.search.sac.agent import act, init, td_target, update
+from vsearch_jax.search.sac.policy import PolicyEnd, PolicyTask, search
 from vsearch_jax.search.sac.relabel import relabel
-from vsearch_jax.search.sac.replay import ReplayState, init_replay, insert, sample
-from vsearch_jax.search.sac.rollout import PolicyEnd, PolicyTask, search
+from vsearch_jax.search.sac.replay import ReplayState, init_replay, insert, sample_batch
 
 __all__ = [
     "PolicyEnd",
@@ -14,7 +14,7 @@ __all__ = [
     "init_replay",
     "insert",
     "relabel",
-    "sample",
+    "sample_batch",
     "search",
     "td_target",
     "update",

@@ -112,7 +112,7 @@ def td_target(key: Array, state: SACState, transitions: Transition, config: SACC
       transitions: Transition with a leading batch axis B.
       config: SACConfig.
     """
-    observation = transitions.next_observation
+    observation = transitions.next_obs
     action, log_prob = _sample(key, state.actor, observation, config, transitions.action.shape[-1])
     value = _values(state.target_critic, observation, action, config).min(axis=0)
     soft_value = value - jnp.exp(state.log_alpha) * log_prob
@@ -120,7 +120,7 @@ def td_target(key: Array, state: SACState, transitions: Transition, config: SACC
 
 
 def _critic_loss(critic: Any, transitions: Transition, target: Array, config: SACConfig) -> Array:
-    values = _values(critic, transitions.observation, transitions.action, config)
+    values = _values(critic, transitions.obs, transitions.action, config)
     return 0.5 * jnp.sum(jnp.mean((values - target[None]) ** 2, axis=-1))
 
 
@@ -128,8 +128,8 @@ def _actor_loss(
     actor: Any, key: Array, state: SACState, transitions: Transition, config: SACConfig
 ) -> tuple[Array, Array]:
     """Returns the loss and the entropy, both f32[]."""
-    action, log_prob = _sample(key, actor, transitions.observation, config, transitions.action.shape[-1])
-    value = _values(state.critic, transitions.observation, action, config).min(axis=0)
+    action, log_prob = _sample(key, actor, transitions.obs, config, transitions.action.shape[-1])
+    value = _values(state.critic, transitions.obs, action, config).min(axis=0)
     return jnp.mean(jnp.exp(state.log_alpha) * log_prob - value), -jnp.mean(log_prob)
 
 

@@ -32,22 +32,21 @@ def relabel(
     choice_key, candidate_key = jax.random.split(key)
     choice = jax.random.uniform(choice_key, (num,))
     candidate = candidate_codes[jax.random.randint(candidate_key, (num,), 0, candidate_codes.shape[0])]
-    next_code = transitions.next_observation[:, :size]
+    next_code = transitions.next_obs[:, :size]
     is_reachable = transitions.is_reachable > 0.5
     is_own = (choice < config.relabel_fraction / 3.0) & is_reachable
     is_other = choice < config.relabel_fraction
-    target = transitions.observation[:, size : 2 * size]
+    target = transitions.obs[:, size : 2 * size]
     target = jnp.where(is_own[:, None], next_code, jnp.where(is_other[:, None], candidate, target))
 
     similarity = cosine_similarity(next_code, target)
     is_found = is_reachable & (similarity >= env_config.threshold)
     reward = jnp.where(is_found, env_config.success_reward, similarity - 1.0)
     return transitions._replace(
-        observation=_with_target(transitions.observation, target),
-        next_observation=_with_target(transitions.next_observation, target),
+        obs=_with_target(transitions.obs, target),
+        next_obs=_with_target(transitions.next_obs, target),
         reward=jnp.where(is_reachable, reward, env_config.unreachable_reward),
         terminated=is_found.astype(transitions.terminated.dtype),
-        truncated=jnp.where(is_found, 0.0, transitions.truncated),
     )
 
 

@@ -41,7 +41,7 @@ def insert(replay: ReplayState, transitions: Transition) -> ReplayState:
     return ReplayState(data=data, num_inserted=replay.num_inserted + count)
 
 
-def sample(key: Array, replay: ReplayState, batch_size: int) -> Transition:
+def sample_batch(key: Array, replay: ReplayState, batch_size: int) -> Transition:
     """Returns `batch_size` transitions drawn uniformly with replacement; the buffer must not be empty."""
     num_filled = jnp.minimum(replay.num_inserted, replay.data.reward.shape[0])
     index = jax.random.randint(key, (batch_size,), 0, num_filled)

@@ -45,7 +45,7 @@ class PolicyTask:
 
     Attributes:
       actor: parameters of the policy.
-      start: brax State of a started episode: `pipeline_state.sight.view`, `metrics["similarity"]` and
+      start: brax State of a started episode: `pipeline_state.observation.view`, `metrics["similarity"]` and
         `info["is_reachable"]` tell what was seen.
     """
 
@@ -183,4 +183,4 @@ def _action_to(view: View, state: State, config: Config) -> Array:
 
 def _view(state: State) -> View:
     episode: EpisodeState = state.pipeline_state  # pyright: ignore[reportAssignmentType] # brax lets any pytree stand here
-    return episode.sight.view
+    return episode.observation.view

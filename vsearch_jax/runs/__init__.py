@@ -1,0 +1,1 @@
+"""A run on disk: folder, checkpoints, metrics, the loop of chunks."""
