@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from vsearch_jax.robot.arm import build_arm
     from vsearch_jax.scene import build_scene
     from vsearch_jax.training import init, train
+    from vsearch_jax.types import Camera
 
 __all__ = [
+    "Camera",
     "Config",
     "ViewSearchEnv",
     "build_arm",
@@ -31,6 +33,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Camera": "types",
     "Config": "config",
     "ViewSearchEnv": "env",
     "build_arm": "robot.arm",

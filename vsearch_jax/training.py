@@ -19,6 +19,7 @@ from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv, check_band
 from vsearch_jax.search import sac
 from vsearch_jax.types import Observation, TrainState, Transition
+from vsearch_jax.xla.tree import tree_where
 
 ENCODER_STAGE, POLICY_STAGE = 0, 1
 POLICY_METRICS = (
@@ -266,7 +267,7 @@ def pool_start(key: Array, *, env: ViewSearchEnv, pool: Observation) -> Any:
 def restart_ended(key: Array, state: Any, *, env: ViewSearchEnv, pool: Observation) -> Any:
     """Returns `state`, or the start of a new episode where it terminated or was truncated."""
     is_ended = (state.info["terminated"] + state.info["truncated"]) > 0
-    return jax.tree.map(lambda new, old: jnp.where(is_ended, new, old), pool_start(key, env=env, pool=pool), state)
+    return tree_where(is_ended, pool_start(key, env=env, pool=pool), state)
 
 
 def _zeros(tree: Any, leading: tuple[int, ...]) -> Any:

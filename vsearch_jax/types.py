@@ -7,11 +7,18 @@ Frames: `world` is MuJoCo's world frame (z up); a camera looks along its own -z 
 from __future__ import annotations
 
 import enum
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import flax.struct
-import jax
 from jax import Array
+
+if TYPE_CHECKING:  # imports that take seconds, needed for annotations only
+    import optax
+    from brax.envs.base import State
+    from flax import nnx
+
+ParamTree: TypeAlias = "dict[str, ParamTree | Array]"
+"""Network parameters as nested dictionaries of arrays."""
 
 
 class View(NamedTuple):
@@ -113,26 +120,6 @@ class Path:
     status: Array
 
 
-class Trajectory(NamedTuple):
-    """A timed motion along a path with rounded corners; see `vsearch_jax.planning.time_path`. G grid intervals.
-
-    Attributes:
-      waypoints: f32[W, nq] rad or m, of the path.
-      radii: f32[W] rad, how far before and after each waypoint its bend begins and ends.
-      tangents: f32[W - 1, J], unit vectors along the straight pieces, of the joints that move the camera.
-      sizes: f32[G] rad, of the intervals along the path.
-      times: f32[G + 1] s, at their ends.
-      squared_speeds: f32[G + 1] rad^2/s^2, of the path there.
-    """
-
-    waypoints: Array
-    radii: Array
-    tangents: Array
-    sizes: Array
-    times: Array
-    squared_speeds: Array
-
-
 @flax.struct.dataclass
 class ReachabilityMap:
     """Which views of a grid the arm can reach, and with which joints.
@@ -205,6 +192,19 @@ class Transition(NamedTuple):
 
 
 @flax.struct.dataclass
+class ReplayState:
+    """The newest transitions.
+
+    Attributes:
+      data: Transition with a leading axis of the buffer's capacity.
+      num_inserted: i32[], transitions inserted so far; the oldest are overwritten.
+    """
+
+    data: Transition
+    num_inserted: Array
+
+
+@flax.struct.dataclass
 class SACState:
     """Parameters and optimizer states of soft actor-critic.
 
@@ -216,11 +216,11 @@ class SACState:
       opt_states: optax states of actor, critic and log_alpha, in this order.
     """
 
-    actor: Any
-    critic: Any
-    target_critic: Any
+    actor: nnx.State
+    critic: nnx.State
+    target_critic: nnx.State
     log_alpha: Array
-    opt_states: tuple[Any, Any, Any]
+    opt_states: tuple[optax.OptState, optax.OptState, optax.OptState]
 
 
 @flax.struct.dataclass
@@ -234,8 +234,8 @@ class EncoderState:
       whitening: f32[Z, Z], symmetric partial whitening matrix of the mean-free raw latent.
     """
 
-    params: Any
-    opt_state: Any
+    params: ParamTree
+    opt_state: optax.OptState
     latent_mean: Array
     whitening: Array
 
@@ -260,10 +260,26 @@ class TrainState:
     reach: ReachabilityMap
     pool: Observation
     sac: SACState
-    env: Any
-    replay: Any
-    key: jax.Array
+    env: State
+    replay: ReplayState
+    key: Array
     step: Array
+
+
+class PolicyEnd(NamedTuple):
+    """What `SearchResult.end` holds of this searcher.
+
+    Attributes:
+      state: brax State at the end of the episode.
+      num_helped: i32[], steps that were not the policy's.
+      travel: f32[] rad, sum of the steps' metric `joint_travel`.
+      duration: f32[] s, sum of `motion_time`.
+    """
+
+    state: State
+    num_helped: Array
+    travel: Array
+    duration: Array
 
 
 @flax.struct.dataclass
@@ -276,7 +292,7 @@ class SearchResult:
       best_scores: f32[G], best score so far after each generation; the last value repeats after the end.
       evaluations: i32[], images taken until the threshold was met, all of them if it was not.
       unreachable: i32[], how many of these the arm could not reach.
-      end: what the searcher ended in beyond this: of a policy the brax State, else None.
+      end: PolicyEnd where the searcher is a policy, else None.
     """
 
     view: View
@@ -284,4 +300,4 @@ class SearchResult:
     best_scores: Array
     evaluations: Array
     unreachable: Array
-    end: Any = None
+    end: PolicyEnd | None = None

@@ -17,6 +17,7 @@ from vsearch_jax.env.episode import build_obs, check_band, episode_of
 from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.planning import (
     Motion,
+    Trajectory,
     duration,
     nearest_cell,
     reachability_map,
@@ -38,9 +39,9 @@ from vsearch_jax.types import (
     Path,
     PlanStatus,
     ReachabilityMap,
-    Trajectory,
     View,
 )
+from vsearch_jax.xla.tree import tree_where
 
 _REACH_SEED = 20_191_201
 """Of the starts from which the reachability map is solved: the same map in every run, whatever the run's seed."""
@@ -138,9 +139,7 @@ class ViewSearchEnv(Env):
         moved, motion = self.move_to_view(
             self.commanded_view(state, action), episode_of(state).observation.qpos, is_over
         )
-        return jax.tree.map(
-            lambda new, old: jnp.where(is_over, old, new), self.apply_transition(state, moved, motion), state
-        )
+        return tree_where(is_over, state, self.apply_transition(state, moved, motion))
 
     def commanded_view(self, state: State, action: Array) -> View:
         """Returns the view to which `action` (f32[2], clipped to [-1, 1]) leads, whether or not the arm reaches it."""
@@ -152,7 +151,7 @@ class ViewSearchEnv(Env):
         """Returns the state after a step that led to `moved`, or nowhere where its motion was not found."""
         episode, task = episode_of(state), self.config.env
         is_reachable = motion.is_found
-        observation = jax.tree.map(lambda new, stay: jnp.where(is_reachable, new, stay), moved, episode.observation)
+        observation = tree_where(is_reachable, moved, episode.observation)
         similarity = cosine_similarity(observation.code, episode.target.code)
         is_found = is_reachable & (similarity >= task.threshold)
         reward = jnp.where(is_found, task.success_reward, similarity - 1.0)
@@ -199,7 +198,7 @@ class ViewSearchEnv(Env):
         stays = is_reachable | is_fixed
         cell = nearest_cell(self.reach, view)
         near = (View(self.reach.azimuths[cell[0]], self.reach.elevations[cell[1]]), self.reach.qpos[cell])
-        view, joints = jax.tree.map(lambda a, b: jnp.where(stays, a, b), (view, joints), near)
+        view, joints = tree_where(stays, (view, joints), near)
         return view, joints, is_reachable | ~is_fixed
 
     def random_view(self, key: Array) -> tuple[View, Array]:

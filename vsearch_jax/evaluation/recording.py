@@ -17,6 +17,7 @@ from vsearch_jax.evaluation.views import ViewRequest, observe_request, protocol_
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search import sac
 from vsearch_jax.types import TrainState, View
+from vsearch_jax.xla.tree import tree_where
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -82,7 +83,7 @@ def roll_out(step: Callable[[Any], tuple[Any, Any]], start: Any, length: int) ->
 
     def go_on(state: Any, _: None) -> tuple[Any, Any]:
         moved, kept = step(state)
-        moved = jax.tree.map(lambda new, old: jnp.where(state.done > 0, old, new), moved, state)
+        moved = tree_where(state.done > 0, state, moved)
         return moved, (moved, kept)
 
     _, (states, kept) = jax.lax.scan(go_on, start, length=length)

@@ -17,10 +17,10 @@ from vsearch_jax.env import ViewSearchEnv, episode_of
 from vsearch_jax.evaluation.recording import first_actor, opposite_start, roll_out, start_episode
 from vsearch_jax.evaluation.views import ViewRequest
 from vsearch_jax.geometry import cosine_similarity
-from vsearch_jax.planning import duration, state_at
+from vsearch_jax.planning import Trajectory, duration, state_at
 from vsearch_jax.planning.execution import pass_through
 from vsearch_jax.search import sac
-from vsearch_jax.types import Camera, Observation, TrainState, Trajectory, View
+from vsearch_jax.types import Camera, Observation, TrainState, View
 from vsearch_jax.xla.batching import map_in_batches
 
 FPS = 25

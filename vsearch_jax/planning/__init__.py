@@ -8,6 +8,7 @@ from vsearch_jax.planning.starts import ik_from_starts, start_limits
 from vsearch_jax.planning.trajectory import (
     Motion,
     PlanningError,
+    Trajectory,
     check_speeds,
     duration,
     state_at,
@@ -18,6 +19,7 @@ from vsearch_jax.planning.trajectory import (
 __all__ = [
     "Motion",
     "PlanningError",
+    "Trajectory",
     "check_speeds",
     "duration",
     "edge_is_free",

@@ -15,6 +15,7 @@ from vsearch_jax.robot import collision
 from vsearch_jax.robot.arm import Arm
 from vsearch_jax.robot.collision import Axes
 from vsearch_jax.xla.batching import append_axes, batch_axis_last
+from vsearch_jax.xla.tree import tree_where
 
 # A step is as long as if the next sample were nearly as far from everything as this one, and the speed the same. Where
 # that fails, a shorter one is tried, then one that is safe wherever the next sample touches nothing.
@@ -106,7 +107,7 @@ def _advance_once(arm: Arm, qpos: Array, bounds: Bounds, resolution: float, edge
     share = jnp.where(is_probing, PROBES[-2] - PROBES[-1], jnp.maximum(step, 1e-9))
     new = edge._replace(
         done=jnp.where(is_proven, place, edge.done),
-        sample=jax.tree.map(lambda a, b: jnp.where(is_new[None], a, b), sample, edge.sample),
+        sample=tree_where(is_new[None], sample, edge.sample),
         speed=jnp.where(is_new[None], way / share[None], edge.speed),
         sink=jnp.where(is_new[None], jnp.where(is_probing[None], way, fall) / share[None], edge.sink),
         num_tries=jnp.where(is_new, 0, edge.num_tries + 1),
@@ -119,7 +120,7 @@ def _advance_once(arm: Arm, qpos: Array, bounds: Bounds, resolution: float, edge
 
 def _step(pairs: collision.Pairs, edge: Edge, bounds: Bounds, resolution: float) -> Array:
     """Returns f32[], the share of the edge to the next sample."""
-    wide = functools.partial(append_axes, batch=edge.done.ndim)
+    wide = functools.partial(append_axes, count=edge.done.ndim)
     gap, boldness = edge.sample.gap, jnp.asarray(BOLD)[jnp.minimum(edge.num_tries, LAST_TRY)][None]
     extra = jnp.where(edge.num_tries == 0, resolution, 0.0)[None]
     by_levers = (boldness * gap + extra) / jnp.maximum(bounds.rate, 1e-9)

@@ -14,9 +14,9 @@ from mujoco import mjx
 
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning import check_speeds, duration, state_at
+from vsearch_jax.planning.trajectory import Trajectory
 from vsearch_jax.robot.arm import Arm
 from vsearch_jax.scene import Scene, SceneError
-from vsearch_jax.types import Trajectory
 
 
 class Execution(NamedTuple):

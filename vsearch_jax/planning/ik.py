@@ -18,6 +18,8 @@ from vsearch_jax.planning.starts import finite_joints, judge
 from vsearch_jax.robot.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.types import IKResult
 from vsearch_jax.xla import lane_pool
+from vsearch_jax.xla.batching import flatten_vmap
+from vsearch_jax.xla.tree import tree_where
 
 # Lanes of a batch: enough for the vector units, few enough for the cache.
 MOST_LANES = 256
@@ -88,7 +90,7 @@ def ik(arm: Arm, T_world_camera: SE3, qpos: Array, config: IKConfig) -> IKResult
         limits, but the status says so and the result does not count as converged.
       config: iterations, damping, tolerances, number of starts, and whether the camera may roll.
     """
-    solve = lane_pool.flatten_vmap(functools.partial(_solve_batch, config))
+    solve = flatten_vmap(functools.partial(_solve_batch, config))
     poses = (T_world_camera.translation()[None], T_world_camera.rotation().as_matrix()[None])
     result = solve(arm, (*poses, qpos[None]))
     return jax.tree.map(lambda leaf: leaf[0], result)
@@ -159,7 +161,7 @@ def _fresh(config: IKConfig, problem: _Problem) -> _State:
 
 
 def _begin(config: IKConfig, problem: _Problem, state: _State, is_new: Array) -> _State:
-    return jax.tree.map(lambda a, b: jnp.where(is_new, a, b), _fresh(config, problem), state)
+    return tree_where(is_new, _fresh(config, problem), state)
 
 
 def _step(arm: Arm, config: IKConfig, problem: _Problem, state: _State) -> _State:
@@ -179,7 +181,7 @@ def _step(arm: Arm, config: IKConfig, problem: _Problem, state: _State) -> _Stat
     restarted = levenberg.begin(_start(problem, state.start + 1), config)
     iterate = iterate._replace(trial=jnp.where(polish >= 0, along, iterate.trial))
     new = _State(
-        iterate=jax.tree.map(lambda a, b: jnp.where(is_spent, a, b), restarted, iterate),
+        iterate=tree_where(is_spent, restarted, iterate),
         start=jnp.where(is_spent & ~is_last, state.start + 1, state.start),
         iterations=jnp.where(is_spent, 0, state.iterations + 1),
         polish=polish,
@@ -188,7 +190,7 @@ def _step(arm: Arm, config: IKConfig, problem: _Problem, state: _State) -> _Stat
         preference=jnp.minimum(preference, state.preference),
         is_done=is_last | (polish >= config.num_nullspace_steps),
     )
-    return jax.tree.map(lambda a, b: jnp.where(state.is_done, b, a), new, state)
+    return tree_where(state.is_done, state, new)
 
 
 def _is_within(iterate: Iterate, config: IKConfig) -> Array:

@@ -11,6 +11,7 @@ from jaxlie import SE3, SO3
 
 from vsearch_jax.config import IKConfig
 from vsearch_jax.robot.arm import Arm, camera_kinematics
+from vsearch_jax.xla.tree import tree_where
 
 # Metres that one radian weighs in the cost: about the lever of a wrist.
 ROTATION_WEIGHT = 0.3
@@ -104,7 +105,7 @@ def step(arm: Arm, goal: Goal, iterate: Iterate, config: IKConfig) -> Iterate:
     """Keeps the trial if its cost is less, and proposes the next; NaN is never less, so the joints stay finite."""
     new = look(arm, goal, iterate, config)
     is_better = new.cost < iterate.cost
-    kept = jax.tree.map(lambda a, b: jnp.where(is_better, a, b), new, iterate)
+    kept = tree_where(is_better, new, iterate)
     rise = jnp.where(is_better, DAMPING_FALL, DAMPING_RISE)
     damping = jnp.where(jnp.isinf(iterate.cost), kept.damping, jnp.clip(kept.damping * rise, *DAMPING_RANGE))
     kept = kept._replace(damping=damping)

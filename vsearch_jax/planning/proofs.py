@@ -69,7 +69,7 @@ def look(arm: Arm, qpos: Array) -> Sample:
 
 def motion_bounds(pairs: Pairs, change: Array) -> Bounds:
     """Returns the bounds of the edge on which the joints of the chain change by `change` (f32[J] rad or m)."""
-    wide = functools.partial(append_axes, batch=change.ndim - 1)
+    wide = functools.partial(append_axes, count=change.ndim - 1)
     turns = jnp.abs(change)
     before = jnp.cumsum(turns, axis=0) - turns
     # Joint k, turning by w_k, gives a point the speed w_k r_k; it turns that itself, every joint before it twice.
@@ -99,7 +99,7 @@ def is_free_between(pairs: Pairs, ends: tuple[Sample, Sample], step: Array, boun
       bounds: of the edge.
       way: f32[C] m, how far the capsules have moved from one to the other.
     """
-    wide = functools.partial(append_axes, batch=step.ndim)
+    wide = functools.partial(append_axes, count=step.ndim)
     gap, step = ends[0].gap + ends[1].gap, step[None]
     by_levers = gap >= bounds.rate * step + ROUNDING
     stray = (bounds.bend * step * step)[pairs.mover]

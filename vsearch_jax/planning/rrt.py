@@ -17,6 +17,8 @@ from vsearch_jax.planning.trees import Problem
 from vsearch_jax.robot.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.types import Path, PlanStatus
 from vsearch_jax.xla import lane_pool
+from vsearch_jax.xla.batching import flatten_vmap
+from vsearch_jax.xla.tree import tree_where
 
 # Lanes of a batch: more cost less each, but more of them idle at the end.
 MOST_LANES = 64
@@ -51,7 +53,7 @@ def rrt(arm: Arm, key: Array, start: Array, goal: Array, config: PlanningConfig)
 
 
 def _plan(is_bidirectional: bool, arm: Arm, key: Array, start: Array, goal: Array, config: PlanningConfig) -> Path:
-    plan = lane_pool.flatten_vmap(functools.partial(_plan_batch, is_bidirectional, config))
+    plan = flatten_vmap(functools.partial(_plan_batch, is_bidirectional, config))
     result = plan(arm, (key[None], start[None], goal[None]))
     return jax.tree.map(lambda leaf: leaf[0], result)
 
@@ -98,7 +100,7 @@ def _straight(arm: Arm, config: PlanningConfig, problems: Problem, is_open: Arra
 
     def begin(problem: Problem, edge: Edge, is_new: Array) -> Edge:
         fresh = edge_between(arm, problem.start, problem.goal)
-        return jax.tree.map(lambda a, b: jnp.where(is_new, a, b), fresh, edge)
+        return tree_where(is_new, fresh, edge)
 
     job = lane_pool.Job(
         begin,

@@ -11,6 +11,7 @@ from jax import Array
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, is_whole
 from vsearch_jax.robot.arm import Arm
+from vsearch_jax.xla.tree import tree_where
 
 SAMPLES_PER_STEP = 2
 # A shortcut must save this share of the path, else it is not worth its samples.
@@ -62,7 +63,7 @@ def begin(arm: Arm, problem: Crooked, state: Shortcut, is_new: Array) -> Shortcu
         problem,
         state._replace(waypoints=problem.waypoints, num_points=problem.num_points, attempts=jnp.int32(0)),
     )
-    return jax.tree.map(lambda a, b: jnp.where(is_new, a, b), fresh, state)
+    return tree_where(is_new, fresh, state)
 
 
 def is_done(config: PlanningConfig, state: Shortcut) -> Array:
@@ -75,13 +76,13 @@ def step(arm: Arm, config: PlanningConfig, problem: Crooked, state: Shortcut) ->
     edge = advance(arm, state.edge, problem.qpos, config, SAMPLES_PER_STEP)
     is_free = is_whole(edge)
     taken = _cut(state._replace(edge=edge))
-    path = jax.tree.map(lambda a, b: jnp.where(is_free, a, b), taken, (state.waypoints, state.num_points))
+    path = tree_where(is_free, taken, (state.waypoints, state.num_points))
     following = _propose(
         arm, problem, state._replace(waypoints=path[0], num_points=path[1], attempts=state.attempts + 1)
     )
     waiting = state._replace(edge=edge)
-    new = jax.tree.map(lambda a, b: jnp.where(is_settled(edge), a, b), following, waiting)
-    return jax.tree.map(lambda a, b: jnp.where(is_done(config, state), b, a), new, state)
+    new = tree_where(is_settled(edge), following, waiting)
+    return tree_where(is_done(config, state), state, new)
 
 
 def _propose(arm: Arm, problem: Crooked, state: Shortcut) -> Shortcut:

@@ -15,7 +15,7 @@ from jax import Array
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.proofs import look
 from vsearch_jax.robot.arm import Arm
-from vsearch_jax.types import Path, Trajectory
+from vsearch_jax.types import Path
 
 # Intervals of the grid on each straight piece and on each bend.
 GRID = 16
@@ -23,6 +23,26 @@ GRID = 16
 BEND_SHARE, FREE_SHARE = 0.45, 0.9
 # Shorter pieces (rad) count as nothing.
 TINY = 1e-6
+
+
+class Trajectory(NamedTuple):
+    """A timed motion along a path with rounded corners; see `vsearch_jax.planning.time_path`. G grid intervals.
+
+    Attributes:
+      waypoints: f32[W, nq] rad or m, of the path.
+      radii: f32[W] rad, how far before and after each waypoint its bend begins and ends.
+      tangents: f32[W - 1, J], unit vectors along the straight pieces, of the joints that move the camera.
+      sizes: f32[G] rad, of the intervals along the path.
+      times: f32[G + 1] s, at their ends.
+      squared_speeds: f32[G + 1] rad^2/s^2, of the path there.
+    """
+
+    waypoints: Array
+    radii: Array
+    tangents: Array
+    sizes: Array
+    times: Array
+    squared_speeds: Array
 
 
 class PlanningError(ValueError):

@@ -14,6 +14,7 @@ from jax import Array
 from vsearch_jax.config import PlanningConfig
 from vsearch_jax.planning.edges import Edge, advance, edge_between, is_settled, is_whole, reached
 from vsearch_jax.robot.arm import Arm
+from vsearch_jax.xla.tree import tree_where
 
 # Samples of an edge between two looks at the trees, which cost about half as much as one sample.
 SAMPLES_PER_STEP = 2
@@ -92,11 +93,7 @@ def begin(arm: Arm, config: PlanningConfig, problem: Problem, trees: Trees, is_n
         is_found=jnp.bool_(False),
         is_done=jnp.bool_(False),
     )
-    small = jax.tree.map(
-        lambda a, b: jnp.where(is_new, a, b),
-        fresh._replace(nodes=(), parents=()),
-        trees._replace(nodes=(), parents=()),
-    )
+    small = tree_where(is_new, fresh._replace(nodes=(), parents=()), trees._replace(nodes=(), parents=()))
     return small._replace(nodes=nodes, parents=trees.parents)
 
 
@@ -118,7 +115,7 @@ def step(arm: Arm, config: PlanningConfig, is_bidirectional: bool, problem: Prob
     tree, origin, target, is_connecting = _next(arm, config, is_bidirectional, problem, new, (edge, is_kept))
     following = edge_between(arm, nodes[tree, origin], target)
     return new._replace(
-        edge=jax.tree.map(lambda a, b: jnp.where(is_ready, a, b), following, edge),
+        edge=tree_where(is_ready, following, edge),
         tree=jnp.where(is_ready & ~is_found, tree, trees.tree),
         origin=jnp.where(is_ready, origin, trees.origin),
         is_connecting=jnp.where(is_ready, is_connecting, trees.is_connecting),

@@ -5,8 +5,11 @@ from vsearch_jax.render.image import render, render_batch, silhouette, supersamp
 from vsearch_jax.render.mj_poses import Poses, poses
 from vsearch_jax.render.outline import Square, crop, soft_silhouette, square_around
 from vsearch_jax.render.scene import Lights, RenderError, RenderScene, compile_scene
+from vsearch_jax.types import Camera, Image
 
 __all__ = [
+    "Camera",
+    "Image",
     "Lights",
     "Poses",
     "RenderError",

@@ -9,11 +9,11 @@ from jaxlie import SO3
 
 from vsearch_jax.render import trace
 from vsearch_jax.render.geometry.level_sets import affine, level, select
-from vsearch_jax.render.geometry.rays import Vector, dot
 from vsearch_jax.render.light.shading import Surface
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.render.texture import lookup
 from vsearch_jax.xla.materialize import materialize
+from vsearch_jax.xla.vectors import Vector, dot
 
 
 def look_up(table: Array | list[Array], index: Array) -> list[Array]:

@@ -18,8 +18,9 @@ from jax import Array
 from mujoco import mjtGeom
 
 from vsearch_jax.render.geometry.rasterizer import Raster
-from vsearch_jax.render.geometry.rays import CHORD_FUNCTIONS, RAY_FUNCTIONS, Vector, dot
+from vsearch_jax.render.geometry.rays import CHORD_FUNCTIONS, RAY_FUNCTIONS
 from vsearch_jax.render.scene import RenderScene
+from vsearch_jax.xla.vectors import Vector, dot
 
 _INFINITY_BITS = 0x7F800000
 

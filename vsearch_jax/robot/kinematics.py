@@ -81,7 +81,7 @@ def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
       joints: the J joints.
       values: f32[J] rad or m, of the joints; they may have a batch axis more at the end, then the results have it too.
     """
-    count, wide = joints.parent.shape[0], functools.partial(append_axes, batch=values.ndim - 1)
+    count, wide = joints.parent.shape[0], functools.partial(append_axes, count=values.ndim - 1)
     axis, is_slide, rotation = wide(joints.axis), wide(joints.is_slide), wide(joints.rotation)
     change = values - wide(joints.reference)
     angle, offset = jnp.where(is_slide, 0.0, change), jnp.where(is_slide, change, 0.0)

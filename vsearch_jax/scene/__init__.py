@@ -2,5 +2,6 @@
 
 from vsearch_jax.scene.assembly import Scene, build_scene
 from vsearch_jax.scene.files import SceneError, available, xml_folder
+from vsearch_jax.scene.joint_chain import joints_above
 
-__all__ = ["Scene", "SceneError", "available", "build_scene", "xml_folder"]
+__all__ = ["Scene", "SceneError", "available", "build_scene", "joints_above", "xml_folder"]

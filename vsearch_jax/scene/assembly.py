@@ -22,6 +22,7 @@ from vsearch_jax.scene.files import (
     one_line,
     xml_folder,
 )
+from vsearch_jax.scene.joint_chain import joints_above
 
 ARM_PREFIX = "arm/"
 OBJECT_PREFIX = "object/"
@@ -155,11 +156,7 @@ def _check_camera(model: mujoco.MjModel, camera_id: int, path: Path) -> None:
 
 
 def _camera_joints(model: mujoco.MjModel, camera_id: int, path: Path) -> tuple[int, ...]:
-    body, joints = int(model.cam_bodyid[camera_id]), []
-    while body:
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        joints = [*range(first, first + count), *joints]
-        body = int(model.body_parentid[body])
+    joints = joints_above(model, int(model.cam_bodyid[camera_id]))
     if not joints:
         raise SceneError(f"arm file {str(path)!r} has no joint that moves the camera {WRIST_CAMERA!r}")
     return tuple(joints)

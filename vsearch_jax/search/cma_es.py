@@ -24,6 +24,7 @@ from vsearch_jax.config import CMAESConfig
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search.common import Method, Record, ScoreFn, SearchArgs, add_generation, run_search, start_record
 from vsearch_jax.types import SearchResult, View
+from vsearch_jax.xla.tree import tree_where
 
 # One unit of the search space is a quarter turn of azimuth and half the band's height of elevation.
 _AZIMUTH_UNIT = math.pi / 2.0
@@ -143,7 +144,7 @@ def _tell(cma: tuple[CMA_ES, Any], key: Array, args: SearchArgs, state: _State, 
     return dataclasses.replace(
         state,
         record=add_generation(state.record, views, scores, args.threshold),
-        strategy=jax.tree.map(lambda a, b: jnp.where(is_stalled | is_wide, a, b), fresh, strategy),
+        strategy=tree_where(is_stalled | is_wide, fresh, strategy),
         run_fitness=jnp.where(is_stalled, jnp.inf, run_fitness),
         run_point=run_point,
         stalled=jnp.where(is_stalled, 0, stalled),

@@ -1,1 +1,1 @@
-"""What XLA needs and mathematics does not: lane pool, batch layout, fusion boundary."""
+"""What XLA needs and the mathematics does not: lane pool, batch layout, fusion boundary, vectors by coordinate."""

@@ -1,56 +1,106 @@
-"""How batches are laid out and cut: some items at a time to bound memory, the batch axis last where that is faster."""
+"""Layout and size of batches: chunks of a bounded size, one flat batch under nested `vmap`, the batch axis last."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+Shared = TypeVar("Shared")
+Items = TypeVar("Items")
+Results = TypeVar("Results")
 
-def map_in_batches(function: Any, xs: Any, batch_size: int) -> Any:
-    """Returns `function` over the leading axis of `xs`, `batch_size` items at a time.
 
-    Unlike `jax.lax.map` it compiles `function` once also where batches do not come out even: the last item is repeated.
+def map_in_batches(function: Callable[[Items], Results], items: Items, batch_size: int) -> Results:
+    """Maps `function` over the leading axis, `batch_size` items at a time.
+
+    `jax.lax.map` compiles a second program where the batches do not divide the items. This function repeats the last
+    item instead, so it compiles one.
+
+    Args:
+      function: maps one item to one result.
+      items: pytree, leading axis N.
+      batch_size: items of a batch; limited to 1 to N.
+
+    Returns:
+      Pytree of results, leading axis N.
     """
-    count = jax.tree.leaves(xs)[0].shape[0]
+    count = jax.tree.leaves(items)[0].shape[0]
     batch_size = max(1, min(batch_size, count))
     index = jnp.minimum(jnp.arange(count + -count % batch_size), count - 1)
-    results = jax.lax.map(function, jax.tree.map(lambda x: x[index], xs), batch_size=batch_size)
+    results = jax.lax.map(function, jax.tree.map(lambda x: x[index], items), batch_size=batch_size)
     return jax.tree.map(lambda x: x[:count], results)
 
 
-def batch_axis_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Makes `vmap` of a function put the batch axis last, where XLA for CPU vectorises over it and gathers whole rows.
+def flatten_vmap(function: Callable[[Shared, Items], Results]) -> Callable[[Shared, Items], Results]:
+    """Makes `vmap` of a batched function call it once with a larger batch.
+
+    Without it, `vmap` of a function that loops over a batch gives a loop inside a loop.
 
     Args:
-      function: (fixed pytree, pytree of arrays) -> pytree of arrays. It takes and returns arrays with one axis more at
-        the end, too, and then works on each of that axis by itself.
+      function: (shared, items with leading axis N) -> results with leading axis N.
 
     Returns:
-      The same function. Under `vmap` over the second argument alone; `fixed` cannot be mapped over.
+      The same function. Under `vmap` with axis size A over the second argument, it runs on A * N items. `vmap` over
+      the first argument raises NotImplementedError.
     """
+
+    def run_flat(shared: Shared, items: Items) -> Results:
+        axis_size = jax.tree.leaves(items)[0].shape[0]
+        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), items)
+        results = batched(shared, flat)
+        return jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), results)
+
+    batched = _with_vmap_rule(function, run_flat)
+    return batched
+
+
+def batch_axis_last(function: Callable[[Shared, Items], Results]) -> Callable[[Shared, Items], Results]:
+    """Makes `vmap` of a function put the batch axis last.
+
+    XLA on CPU vectorises over a last batch axis, and gathers whole rows.
+
+    Args:
+      function: (shared, items) -> results. It must also accept items whose arrays have one more axis at the end, and
+        then treat each position of that axis independently.
+
+    Returns:
+      The same function. `vmap` over the first argument raises NotImplementedError.
+    """
+
+    def run_last(shared: Shared, items: Items) -> Results:
+        results = function(shared, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), items))
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), results)
+
+    return _with_vmap_rule(function, run_last)
+
+
+def _with_vmap_rule(
+    function: Callable[[Shared, Items], Results], run_batch: Callable[[Shared, Items], Results]
+) -> Callable[[Shared, Items], Results]:
+    """Returns `function` with `run_batch` as its batching rule; items that are not mapped are repeated."""
     batched = jax.custom_batching.custom_vmap(function)
 
     @batched.def_vmap
-    def rule(axis_size: int, in_batched: list[Any], fixed: Any, items: Any) -> tuple[Any, Any]:
+    def rule(axis_size: int, in_batched: tuple[Shared, Items], shared: Shared, items: Items) -> tuple[Results, Results]:
         if any(jax.tree.leaves(in_batched[0])):
-            raise NotImplementedError("the arm cannot be mapped over: call the function once for each arm")
-
-        def last(leaf: Array, is_mapped: bool) -> Array:
-            return (
-                jnp.moveaxis(leaf, 0, -1) if is_mapped else jnp.broadcast_to(leaf[..., None], (*leaf.shape, axis_size))
+            raise NotImplementedError(
+                "vmap over the first argument (an arm, for example) is not supported; call the function once for each"
             )
-
-        results = function(fixed, jax.tree.map(last, items, in_batched[1]))
-        results = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), results)
+        repeated = jax.tree.map(
+            lambda leaf, is_mapped: leaf if is_mapped else jnp.broadcast_to(leaf[None], (axis_size, *leaf.shape)),
+            items,
+            in_batched[1],
+        )
+        results = run_batch(shared, repeated)
         return results, jax.tree.map(lambda _: True, results)
 
     return batched
 
 
-def append_axes(leaf: Array, batch: int) -> Array:
-    """Returns `leaf` with `batch` axes of length one more at the end, to go with arrays that have the batch there."""
-    return leaf.reshape(*leaf.shape, *[1] * batch)
+def append_axes(leaf: Array, count: int) -> Array:
+    """Returns `leaf` with `count` axes of length 1 at the end, to broadcast with arrays whose batch axes are last."""
+    return leaf.reshape(*leaf.shape, *[1] * count)

@@ -1,145 +1,147 @@
-"""Many problems of unequal length over a fixed number of lanes, inside one traced loop.
+"""Runs N problems of unequal length on L lanes, inside one traced loop.
 
-Under `vmap` a loop runs until its slowest item ends, and every item pays for that. Here each lane takes the next
-problem of the queue when its own is done, as a pool of workers would; memory does not grow with the problems.
+Under `vmap` a loop runs until its slowest item ends, and each item pays for that. Here a lane takes the next problem of
+a queue as soon as its own is done. Memory grows with the number of lanes, not with the number of problems.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-# Lanes are refilled once this share of them has finished: refilling costs about as much as a few steps.
+Problem = TypeVar("Problem")
+State = TypeVar("State")
+Result = TypeVar("Result")
+Tree = TypeVar("Tree")
+
+# Lanes are refilled once a 1/8 of the busy ones has finished. A refill costs about as much as a few steps.
 REFILL_SHARE = 8
-# At the end this share of the lanes goes on alone, and of those again.
+# When the queue is empty, a 1/4 of the lanes continues alone, and then a 1/4 of those. Idle lanes cost as much as busy.
 TAIL_SHARES = (4, 4)
 
 
-class Job(NamedTuple):
-    """What a lane does; functions of one item.
+class Job(NamedTuple, Generic[Problem, State, Result]):
+    """What a lane does. Each function handles one item.
 
     Attributes:
-      reset: (problem, state, is_new bool[]) -> state: of a new problem where `is_new`, else unchanged. It gets the old
-        state, so that large buffers need not be cleared.
-      step: (problem, state) -> state; a state that is done must come back unchanged.
+      reset: (problem, state, is_new bool[]) -> state. Returns the start state of `problem` where `is_new`, else the
+        given state. It receives the old state so that large buffers need not be cleared.
+      step: (problem, state) -> state. Must return a finished state unchanged.
       is_done: state -> bool[].
       result: (problem, state) -> result.
-      has_stragglers: some problems take many more steps than others. Then the last few go on alone, which
-        is compiled apart and so takes longer to compile.
+      has_stragglers: whether a few problems take many more steps than the others. The last few then continue on fewer
+        lanes. This loop is compiled separately, so it costs compile time.
     """
 
-    reset: Callable[[Any, Any, Array], Any]
-    step: Callable[[Any, Any], Any]
-    is_done: Callable[[Any], Array]
-    result: Callable[[Any, Any], Any]
+    reset: Callable[[Problem, State, Array], State]
+    step: Callable[[Problem, State], State]
+    is_done: Callable[[State], Array]
+    result: Callable[[Problem, State], Result]
     has_stragglers: bool = True
 
 
-class _Run(NamedTuple):
-    """Lanes with the problems they hold (its number N where they idle), the queue's head, and the results so far."""
+class Queue(NamedTuple):
+    """Which of N problems to run, and in which order.
 
-    states: Any
+    Attributes:
+      order: i32[N], numbers of the problems; those to run come first.
+      num_queued: i32[], how many of them to run.
+    """
+
+    order: Array
+    num_queued: Array
+
+
+class _Run(NamedTuple, Generic[State, Result]):
+    """The loop's state.
+
+    Attributes:
+      states: the lanes' states, leading axis L.
+      held: i32[L], number of the problem that each lane holds; N where it is idle.
+      head: i32[], place in the queue of the next problem.
+      results: pytree, leading axis N.
+    """
+
+    states: State
     held: Array
     head: Array
-    results: Any
+    results: Result
 
 
-def run(job: Job, problems: Any, order: tuple[Array, Array], states: Any, results: Any) -> Any:
-    """Returns `results` with the rows of the problems that were worked on replaced.
+def queue_where(is_wanted: Array) -> Queue:
+    """Returns the queue of the problems where `is_wanted` (bool[N]), in ascending order."""
+    return Queue(jnp.argsort(~is_wanted).astype(jnp.int32), jnp.sum(is_wanted, dtype=jnp.int32))
+
+
+def run(job: Job[Problem, State, Result], problems: Problem, queue: Queue, states: State, results: Result) -> Result:
+    """Runs the queued problems.
 
     Args:
       job: what to do.
       problems: pytree, leading axis N.
-      order: i32[N], which problem comes when, and i32[], how many of them are worked on.
-      states: pytree, leading axis L: the lanes; their content is overwritten.
+      queue: which problems to run.
+      states: pytree, leading axis L, the lanes. Their content is overwritten.
       results: pytree, leading axis N, as `job.result` returns them.
+
+    Returns:
+      `results` with the rows of the queued problems replaced.
     """
-    num_problems, num_lanes = order[0].shape[0], jax.tree.leaves(states)[0].shape[0]
+    num_problems, num_lanes = queue.order.shape[0], jax.tree.leaves(states)[0].shape[0]
     state = _Run(states, jnp.full(num_lanes, num_problems, jnp.int32), jnp.int32(0), results)
-    # When the queue is empty and few are left, these go on alone: all lanes cost the same, idle or not.
     for share in TAIL_SHARES if job.has_stragglers else ():
-        few = state.held.shape[0] // share
-        if few == 0:
+        num_left = state.held.shape[0] // share
+        if num_left == 0:
             break
-        state = _loop(job, problems, order, state, few)
-        busy = jnp.argsort(state.held >= num_problems)[:few]
+        state = _run_until(job, problems, queue, state, num_left)
+        busy = jnp.argsort(state.held >= num_problems)[:num_left]
         state = state._replace(states=_rows(state.states, busy), held=state.held[busy])
-    return _loop(job, problems, order, state, 0).results
+    return _run_until(job, problems, queue, state, 0).results
 
 
-def _loop(job: Job, problems: Any, order: tuple[Array, Array], state: _Run, few: int) -> _Run:
-    """Works until the queue is empty and no more than `few` lanes are busy."""
-    idle, count = order[0].shape[0], order[1]
+def _run_until(
+    job: Job[Problem, State, Result], problems: Problem, queue: Queue, state: _Run[State, Result], num_left: int
+) -> _Run[State, Result]:
+    """Runs until the queue is empty and at most `num_left` lanes are busy."""
+    idle = queue.order.shape[0]
 
-    def is_open(state: _Run) -> Array:
-        return (state.head < count) | (jnp.sum(state.held < idle) > few)
+    def has_work(state: _Run[State, Result]) -> Array:
+        return (state.head < queue.num_queued) | (jnp.sum(state.held < idle) > num_left)
 
-    def work(state: _Run) -> _Run:
-        state = _refill(job, problems, order, state)
+    def refill_and_step(state: _Run[State, Result]) -> _Run[State, Result]:
+        state = _refill(job, problems, queue, state)
         current, is_held = _rows(problems, state.held), state.held < idle
         num_held = jnp.sum(is_held)
-        # At the queue's end nobody can be refilled.
-        enough = jnp.where(state.head < count, num_held // REFILL_SHARE, num_held - few)
+        # When the queue is empty, no lane can be refilled.
+        enough = jnp.where(state.head < queue.num_queued, num_held // REFILL_SHARE, num_held - num_left)
 
-        def goes_on(states: Any) -> Array:
+        def is_below_refill(states: State) -> Array:
             return jnp.sum(jax.vmap(job.is_done)(states) & is_held) < jnp.maximum(enough, 1)
 
-        states = jax.lax.while_loop(goes_on, lambda states: jax.vmap(job.step)(current, states), state.states)
+        states = jax.lax.while_loop(is_below_refill, lambda states: jax.vmap(job.step)(current, states), state.states)
         is_done = jax.vmap(job.is_done)(states) & is_held
         row = jnp.where(is_done, state.held, idle)
         found = jax.vmap(job.result)(current, states)
         results = jax.tree.map(lambda old, new: old.at[row].set(new, mode="drop"), state.results, found)
         return state._replace(states=states, held=jnp.where(is_done, idle, state.held), results=results)
 
-    return jax.lax.while_loop(is_open, work, state)
+    return jax.lax.while_loop(has_work, refill_and_step, state)
 
 
-def _refill(job: Job, problems: Any, order: tuple[Array, Array], state: _Run) -> _Run:
+def _refill(
+    job: Job[Problem, State, Result], problems: Problem, queue: Queue, state: _Run[State, Result]
+) -> _Run[State, Result]:
     """Gives the next problems of the queue to idle lanes."""
-    (queue, count), idle = order, order[0].shape[0]
+    idle = queue.order.shape[0]
     rank = state.head + jnp.cumsum(state.held >= idle) - 1
-    is_new = (state.held >= idle) & (rank < count)
-    held = jnp.where(is_new, queue[jnp.clip(rank, 0, idle - 1)], state.held)
+    is_new = (state.held >= idle) & (rank < queue.num_queued)
+    held = jnp.where(is_new, queue.order[jnp.clip(rank, 0, idle - 1)], state.held)
     states = jax.vmap(job.reset)(_rows(problems, held), state.states, is_new)
     return state._replace(states=states, held=held, head=state.head + jnp.sum(is_new, dtype=jnp.int32))
 
 
-def queue_where(is_wanted: Array) -> tuple[Array, Array]:
-    """Returns the `order` that works on the problems where `is_wanted` (bool[N]), first to last."""
-    return jnp.argsort(~is_wanted).astype(jnp.int32), jnp.sum(is_wanted, dtype=jnp.int32)
-
-
-def _rows(problems: Any, index: Array) -> Any:
-    return jax.tree.map(lambda leaf: leaf[jnp.minimum(index, leaf.shape[0] - 1)], problems)
-
-
-def flatten_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Makes `vmap` of a batched function one larger batch instead of a loop in a loop.
-
-    Args:
-      function: (shared pytree, batched pytree, leading axis N) -> pytree, leading axis N.
-
-    Returns:
-      The same function. Under `vmap` over the second argument alone the batch is A * N; `shared` cannot be mapped.
-    """
-    batched = jax.custom_batching.custom_vmap(function)
-
-    @batched.def_vmap
-    def rule(axis_size: int, in_batched: list[Any], shared: Any, problems: Any) -> tuple[Any, Any]:
-        if any(jax.tree.leaves(in_batched[0])):
-            raise NotImplementedError("the arm cannot be mapped over: call the function once for each arm")
-        whole = jax.tree.map(
-            lambda leaf, is_mapped: leaf if is_mapped else jnp.broadcast_to(leaf[None], (axis_size, *leaf.shape)),
-            problems,
-            in_batched[1],
-        )
-        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), whole)
-        results = batched(shared, flat)
-        results = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), results)
-        return results, jax.tree.map(lambda _: True, results)
-
-    return batched
+def _rows(tree: Tree, index: Array) -> Tree:
+    return jax.tree.map(lambda leaf: leaf[jnp.minimum(index, leaf.shape[0] - 1)], tree)

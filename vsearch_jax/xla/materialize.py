@@ -1,46 +1,53 @@
-"""A boundary that XLA's fusion does not cross."""
+"""A fusion boundary for XLA.
+
+XLA on CPU fuses an expression into every place that uses it, and computes it again there. `optimization_barrier` does
+not prevent this. A loop does: its operands are written to memory, even if the loop runs zero times.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+Tree = TypeVar("Tree")
 
-def _is_left(state: tuple[Array, Array, Any]) -> Array:
+
+def _has_next(state: tuple[Array, Array, Tree]) -> Array:
     return state[0] < state[1]
 
 
-def _change(state: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
-    # Never runs; a body that changed nothing would be optimised away.
+def _change_all(state: tuple[Array, Array, Tree]) -> tuple[Array, Array, Tree]:
+    # Never runs. XLA would remove a body that leaves the tree unchanged.
     return state[0] + 1, state[1], jax.tree.map(lambda leaf: leaf + jnp.ones((), leaf.dtype), state[2])
 
 
 @jax.custom_jvp
-def materialize(tree: Any, zero: Array) -> Any:
-    """Returns `tree` as it is, but written to memory before it is used.
-
-    XLA on CPU fuses whatever it can and computes anew what several results share; `optimization_barrier` does not stop
-    it. The arguments of a loop are written, though, even if its run-time number of iterations is none.
+def materialize(tree: Tree, zero: Array) -> Tree:
+    """Returns `tree` unchanged, and forces XLA to write it to memory once.
 
     Args:
-      tree: pytree of arrays of numbers.
-      zero: i32[], always 0, in a way that the compiler cannot know; see `runtime_zero`.
+      tree: pytree of numeric arrays.
+      zero: i32[], 0 at run time. Must not be a compile-time constant; see `runtime_zero`.
+
+    Returns:
+      The same values. Derivatives pass through.
     """
-    return jax.lax.while_loop(_is_left, _change, (jnp.zeros_like(zero), zero, tree))[2]
+    return jax.lax.while_loop(_has_next, _change_all, (jnp.zeros_like(zero), zero, tree))[2]
 
 
 @materialize.defjvp
-def _materialize_jvp(primals: tuple[Any, Array], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+def _materialize_jvp(primals: tuple[Tree, Array], tangents: tuple[Tree, Array]) -> tuple[Tree, Tree]:
     return materialize(*primals), tangents[0]
 
 
-def runtime_zero(lengths: Array) -> Array:
-    """Returns i32[] 0, computed from `lengths` (any shape).
+def runtime_zero(values: Array) -> Array:
+    """Returns i32[] 0, computed so that the compiler cannot know its value.
 
-    They must be known at run time only: what the compiler can compute is no secret to it.
+    Args:
+      values: f32 of any shape. Must not be a compile-time constant.
     """
-    lengths = jax.lax.stop_gradient(lengths)
-    return jnp.any(jnp.where(lengths < 1e30, lengths, 0.0) > 1e30).astype(jnp.int32)
+    values = jax.lax.stop_gradient(values)
+    return jnp.any(jnp.where(values < 1e30, values, 0.0) > 1e30).astype(jnp.int32)

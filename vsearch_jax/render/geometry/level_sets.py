@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from mujoco import mjtGeom
 
-from vsearch_jax.render.geometry.rays import Vector, dot
+from vsearch_jax.xla.vectors import Vector, dot
 
 Level = tuple[Array, Vector]
 

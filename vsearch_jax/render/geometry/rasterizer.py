@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.render.geometry.rays import Vector
 from vsearch_jax.render.geometry.triangles import Triangles
 from vsearch_jax.xla.materialize import materialize
+from vsearch_jax.xla.vectors import Vector
 
 # A face that reaches closer to the viewer's plane, in m, is not projected; it is tested in all pixels.
 _NEAR = 1e-6

@@ -24,15 +24,10 @@ import jax.numpy as jnp
 from jax import Array
 from mujoco import mjtGeom
 
-Vector = tuple[Array, Array, Array]
+from vsearch_jax.xla.vectors import Vector, dot
 
 # Far below any squared length of a scene in metres, far above the smallest normal f32.
 _TINY = 1e-20
-
-
-def dot(a: Vector, b: Vector) -> Array:
-    """Returns the inner product of two triples of broadcasting arrays."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _safe_inverse(x: Array) -> Array:

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.render import trace
-from vsearch_jax.render.geometry.rays import Vector
 from vsearch_jax.render.light import shading, shadow_map
 from vsearch_jax.render.light.shadow_map import ShadowMap
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.types import Camera
+from vsearch_jax.xla.vectors import Vector
 
 
 class LightPoses(NamedTuple):

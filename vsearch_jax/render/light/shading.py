@@ -7,8 +7,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.render.geometry.rays import Vector, dot
 from vsearch_jax.render.scene import Lights, RenderScene
+from vsearch_jax.xla.vectors import Vector, dot
 
 _TINY = 1e-12
 

@@ -15,8 +15,8 @@ from jax import Array
 
 from vsearch_jax.render import trace
 from vsearch_jax.render.geometry.rasterizer import Pinhole, View, rasterize
-from vsearch_jax.render.geometry.rays import Vector, dot
 from vsearch_jax.render.scene import RenderScene
+from vsearch_jax.xla.vectors import Vector, dot
 
 # Cells of a map along an edge, for each pixel of the image's longer edge.
 _CELLS_PER_PIXEL = 1.0

@@ -10,8 +10,8 @@ from jax import Array
 from mujoco import mjtGeom
 
 from vsearch_jax.render.geometry.level_sets import select
-from vsearch_jax.render.geometry.rays import Vector
 from vsearch_jax.render.texture.atlas import CUBE, FACES, PLAIN, PRIMITIVE, Textures
+from vsearch_jax.xla.vectors import Vector
 
 Coordinates = tuple[Array, Array]
 

@@ -16,9 +16,9 @@ from jax import Array
 
 from vsearch_jax.robot.collision import primitives
 from vsearch_jax.robot.collision.pairs import Pairs, Solids
-from vsearch_jax.robot.collision.primitives import Vector
 from vsearch_jax.robot.kinematics import rotate_each
 from vsearch_jax.xla.batching import append_axes
+from vsearch_jax.xla.vectors import Vector, dot
 
 
 class Axes(NamedTuple):
@@ -50,7 +50,7 @@ def pair_distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_heigh
 def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
     """Returns the axes of the capsules from the frames of the joints; see `kinematics.frames`, also for batches."""
     frame = pairs.placement.frame
-    wide = functools.partial(append_axes, batch=positions.ndim - 2)
+    wide = functools.partial(append_axes, count=positions.ndim - 2)
     rotation = rotations[frame]
     center = positions[frame] + rotate_each(rotation, wide(pairs.placement.position))
     half_axis = rotate_each(rotation, wide(pairs.frame_half_axis))
@@ -60,7 +60,7 @@ def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
 def distances_from_axes(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
     """Returns what `pair_distances` does, from the axes of the capsules; these may have a batch axis more at the end."""
     center, half_axis = axes
-    wide = functools.partial(append_axes, batch=center[0].ndim - 1)
+    wide = functools.partial(append_axes, count=center[0].ndim - 1)
     radius = wide(pairs.radius)
     lowest = center[2] - jnp.abs(half_axis[2]) - radius
     first, second = pairs.first, pairs.second
@@ -92,7 +92,7 @@ def _in_frames(solids: Solids, axes: Axes, wide: Callable[[Array], Array]) -> Ax
     first, second, third = columns
 
     def turned(vector: Vector) -> Vector:
-        return primitives.dot(first, vector), primitives.dot(second, vector), primitives.dot(third, vector)
+        return dot(first, vector), dot(second, vector), dot(third, vector)
 
     return Axes(turned(offset), turned(half_axis))
 

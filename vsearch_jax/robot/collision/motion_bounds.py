@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
+
+from vsearch_jax.scene import joints_above
 
 HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -31,16 +35,6 @@ def lever_arms(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[int, ..
     return levers
 
 
-def joints_above(model: mujoco.MjModel, body: int) -> list[int]:
-    """Returns the joints that move `body`, from the world outward."""
-    joints: list[int] = []
-    while body:
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        joints = [*range(first, first + count), *joints]
-        body = int(model.body_parentid[body])
-    return joints
-
-
 def extent_from_still_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.ndarray, float]:
     """Returns a point f64[3] m in world that no joint moves, and the farthest in m that any of `geom` gets from it."""
     chain = joints_above(model, int(model.geom_bodyid[geom]))
@@ -51,7 +45,7 @@ def extent_from_still_point(model: mujoco.MjModel, data: mujoco.MjData, geom: in
     return data.xanchor[chain[0]], _travel(model, data, chain[:1]) + _spread(model, data, geom, chain)
 
 
-def _reach(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: list[int]) -> float:
+def _reach(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]) -> float:
     """Returns the farthest in m that any point of `geom` gets from the axis of the first joint of `chain`."""
     if len(chain) == 1:
         points, radius = _hull(model, data, geom)
@@ -63,20 +57,20 @@ def _reach(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: list[in
     )
 
 
-def _spread(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: list[int]) -> float:
+def _spread(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]) -> float:
     """Returns the farthest in m that any point of `geom` gets from the anchor of the first joint of `chain`."""
-    anchors = data.xanchor[chain]
+    anchors = data.xanchor[list(chain)]
     between = float(np.linalg.norm(np.diff(anchors, axis=0), axis=1).sum())
     points, radius = _hull(model, data, geom)
     tip = max(float(np.linalg.norm(point - anchors[-1])) for point in points) + radius
     return between + tip + _travel(model, data, chain[1:])
 
 
-def _travel(model: mujoco.MjModel, data: mujoco.MjData, joints: list[int]) -> float:
+def _travel(model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int]) -> float:
     """Returns how far in m the slides among `joints` shift what hangs on them, against `qpos0`."""
-    reference = model.qpos0[model.jnt_qposadr[joints]]
-    shift = np.abs(model.jnt_range[joints] - reference[:, None]).max(axis=1)
-    return float(shift[model.jnt_type[joints] == SLIDE].sum())
+    reference = model.qpos0[model.jnt_qposadr[list(joints)]]
+    shift = np.abs(model.jnt_range[list(joints)] - reference[:, None]).max(axis=1)
+    return float(shift[model.jnt_type[list(joints)] == SLIDE].sum())
 
 
 def _from_axis(data: mujoco.MjData, joint: int, point: np.ndarray) -> float:

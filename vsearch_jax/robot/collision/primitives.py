@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-Vector = tuple[Array, Array, Array]
+from vsearch_jax.xla.vectors import Vector, dot
 
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 # 0.618^14 = 1e-3 of the axis; near its minimum the distance changes by far less. The ends are looked at too.
@@ -28,11 +28,6 @@ NEWTON_ITERATIONS = 6
 def coordinates(vectors: Array) -> Vector:
     """Returns the coordinates of `vectors` (f32[..., 3])."""
     return vectors[..., 0], vectors[..., 1], vectors[..., 2]
-
-
-def dot(a: Vector, b: Vector) -> Array:
-    """Returns the inner product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def rotate(rotation: Array, vector: Vector) -> Vector:

@@ -1,14 +1,12 @@
 """Soft actor-critic with goal relabelling: networks, update, replay and the roll-out of the policy."""
 
 from vsearch_jax.search.sac.agent import act, init, td_target, update
-from vsearch_jax.search.sac.policy import PolicyEnd, PolicyTask, search
+from vsearch_jax.search.sac.policy import PolicyTask, search
 from vsearch_jax.search.sac.relabel import relabel
-from vsearch_jax.search.sac.replay import ReplayState, init_replay, insert, sample_batch
+from vsearch_jax.search.sac.replay import init_replay, insert, sample_batch
 
 __all__ = [
-    "PolicyEnd",
     "PolicyTask",
-    "ReplayState",
     "act",
     "init",
     "init_replay",

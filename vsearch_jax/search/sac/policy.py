@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import flax.struct
 import jax
@@ -26,7 +26,8 @@ from vsearch_jax.search.common import (
     to_result,
 )
 from vsearch_jax.search.sac.agent import act
-from vsearch_jax.types import EpisodeState, SearchResult, View
+from vsearch_jax.types import EpisodeState, PolicyEnd, SearchResult, View
+from vsearch_jax.xla.tree import tree_where
 
 _IMPROVEMENT = 3e-3
 """A step that raises the best cosine by less comes no nearer."""
@@ -51,22 +52,6 @@ class PolicyTask:
 
     actor: Any
     start: State
-
-
-class PolicyEnd(NamedTuple):
-    """What `SearchResult.end` holds of this searcher.
-
-    Attributes:
-      state: brax State at the end of the episode.
-      num_helped: i32[], steps that were not the policy's.
-      travel: f32[] rad, sum of the steps' metric `joint_travel`.
-      duration: f32[] s, sum of `motion_time`.
-    """
-
-    state: State
-    num_helped: Array
-    travel: Array
-    duration: Array
 
 
 @flax.struct.dataclass
@@ -137,7 +122,7 @@ def _step(key: Array, step_fn: StepFn, args: SearchArgs, config: Config, carry: 
     around_key, sweep_key = jax.random.split(key)  # the same at every step, so that the turns go on
     around = _around_best(around_key, record, num_around, args)
     swept = _swept(sweep_key, steps, state, args.band, config)
-    view = jax.tree.map(lambda a, b: jnp.where(is_near, a, b), around, swept)
+    view = tree_where(is_near, around, swept)
     observation: Array = state.obs  # pyright: ignore[reportAssignmentType] # brax allows dictionaries too
     action = act(None, args.task.actor, observation, config.sac)
     state = step_fn(state, jnp.where(is_helped, _action_to(view, state, config), action))

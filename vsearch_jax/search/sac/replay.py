@@ -6,25 +6,11 @@ run, so every insertion would copy the buffer. Here an insertion writes its own 
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.types import Transition
-
-
-@flax.struct.dataclass
-class ReplayState:
-    """The newest transitions.
-
-    Attributes:
-      data: Transition with a leading axis of the buffer's capacity.
-      num_inserted: i32[], transitions inserted so far; the oldest are overwritten.
-    """
-
-    data: Transition
-    num_inserted: Array
+from vsearch_jax.types import ReplayState, Transition
 
 
 def init_replay(example: Transition, capacity: int) -> ReplayState:

@@ -1,0 +1,20 @@
+"""The joints between the world and a body."""
+
+from __future__ import annotations
+
+import mujoco
+
+
+def joints_above(model: mujoco.MjModel, body: int) -> list[int]:
+    """Returns the numbers of the joints that move a body, from the world outward.
+
+    Args:
+      model: the compiled model.
+      body: MuJoCo's number of the body.
+    """
+    joints: list[int] = []
+    while body:
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        joints = [*range(first, first + count), *joints]
+        body = int(model.body_parentid[body])
+    return joints
