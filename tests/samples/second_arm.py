@@ -1,4 +1,8 @@
-"""A made-up arm unlike the LWR: a slide, joints off their bodies' origins, boxes, a branch beside the camera."""
+"""An invented arm that differs from the LWR.
+
+It has a slide, joints away from the origins of their bodies, geoms that are not capsules, and a branch that does not
+move the camera.
+"""
 
 MJCF = """
 <mujoco model="second">

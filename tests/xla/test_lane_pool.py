@@ -1,4 +1,4 @@
-"""The pool of lanes gives each problem what it would get alone."""
+"""The lane pool returns for each problem the result that it has alone."""
 
 import functools
 
@@ -18,22 +18,22 @@ JOB = lane_pool.Job(
 )
 
 
-def _count(num_lanes: int, _, problems):
-    order = lane_pool.queue_where(problems >= 0)
-    return lane_pool.run(JOB, problems, order, jnp.zeros((num_lanes, 2), jnp.int32), jnp.full_like(problems, -7))
+def _run_pool(num_lanes: int, _, problems):
+    queue = lane_pool.queue_where(problems >= 0)
+    return lane_pool.run(JOB, problems, queue, jnp.zeros((num_lanes, 2), jnp.int32), jnp.full_like(problems, -7))
 
 
 @pytest.mark.parametrize("num_lanes", [1, 7, 16, 64])
-def test_every_problem_is_worked_on_once_and_to_its_end(num_lanes):
+def test_each_queued_problem_runs_once_and_to_its_end(num_lanes):
     problems = np.random.default_rng(0).integers(-3, 200, 150).astype(np.int32)
-    found = jax.jit(functools.partial(_count, num_lanes, None))(problems)
+    found = jax.jit(functools.partial(_run_pool, num_lanes, None))(problems)
     np.testing.assert_array_equal(found, np.where(problems < 0, -7, problems * 1001))
 
 
 def test_vmap_of_vmap_is_one_larger_batch():
-    count = flatten_vmap(functools.partial(_count, 8))
+    run_pool = flatten_vmap(functools.partial(_run_pool, 8))
     problems = jnp.arange(24).reshape(2, 3, 4)
-    found = jax.jit(jax.vmap(jax.vmap(lambda p: count(None, p))))(problems)
+    found = jax.jit(jax.vmap(jax.vmap(lambda p: run_pool(None, p))))(problems)
     np.testing.assert_array_equal(found, problems * 1001)
     with pytest.raises(NotImplementedError, match="not supported"):
         jax.vmap(flatten_vmap(lambda shared, p: p + shared))(jnp.ones(2), jnp.ones((2, 3)))

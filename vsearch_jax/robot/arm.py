@@ -1,4 +1,4 @@
-"""Kinematics, limits and clearance of the arm in a scene."""
+"""Kinematics, joint limits and clearance of the arm in a scene."""
 
 from __future__ import annotations
 
@@ -23,24 +23,25 @@ class Arm:
     """An arm in its scene.
 
     Attributes:
-      joints: every joint of the model.
-      chain: the J joints between the world and the wrist camera, each hanging on the one before.
+      joints: all joints of the model.
+      chain: the J joints between the world and the wrist camera. Each joint hangs on the joint before it.
       wrist: f32[4, 4], pose of the wrist camera in the frame of the last joint of `chain`.
       bodies: Placement of the bodies.
       geoms: Placement of the geoms.
       sites: Placement of the sites.
       cameras: Placement of the cameras.
-      lower: f32[nq] rad or m, lower limits; -inf without one.
-      upper: f32[nq] rad or m, upper limits; +inf without one.
-      home: f32[nq] rad or m, middle of the limits.
-      speed: f32[nq] rad/s or m/s, speed limits; NaN where the model gives none (`user` of the joint).
-      pairs: geometry that must not touch.
-      planning_pairs: those of them that planning must look at.
+      lower: f32[nq] rad or m, lower joint limits; -inf for a joint without limits.
+      upper: f32[nq] rad or m, upper joint limits; +inf for a joint without limits.
+      home: f32[nq] rad or m, middle of the limits; `qpos0` for a joint without limits.
+      speed: f32[nq] rad/s or m/s, speed limits; NaN where the model gives none. The model gives a speed limit as the
+        attribute `user` of a joint.
+      pairs: pairs of geoms that must not touch.
+      planning_pairs: the subset of `pairs` that planning checks. Ellipsoids are replaced by enclosing capsules.
       table_height: f32[] m, world z of the table.
-      table_clearance: f32[] m, least distance from the table.
-      data: mjx.Data into which `forward_kinematics` writes.
-      camera_id: the wrist camera.
-      joints_without_speed: names of the joints that move the camera and have no speed limit.
+      table_clearance: f32[] m, minimum distance from the table.
+      data: mjx.Data, template that `forward_kinematics` fills.
+      camera_id: MuJoCo's number of the wrist camera.
+      joints_without_speed: names of the joints of `chain` that have no speed limit.
     """
 
     joints: Joints
@@ -65,13 +66,13 @@ class Arm:
 
 @flax.struct.dataclass
 class Clearance:
-    """Signed distances in m of the arm's moving geoms from what they must not touch; +inf where there is nothing.
+    """Signed distances in m between the arm's moving geoms and other geoms; +inf where there are no other geoms.
 
     Attributes:
-      table: f32[], of the lowest point from the table.
-      object: f32[], from the nearest geom of the object.
+      table: f32[], from the table.
+      object: f32[], from the object.
       self: f32[], between links that are not neighbours, and from the mount.
-      obstacles: f32[], from whatever else stands around.
+      obstacles: f32[], from the obstacles.
     """
 
     table: Array
@@ -84,52 +85,61 @@ def build_arm(scene: Scene) -> Arm:
     """Returns the arm of `scene`.
 
     Raises:
-      SceneError: a joint that moves the camera has no limits.
+      SceneError: a joint that moves the wrist camera has no limits.
     """
-    model = scene.mj_model
-    data = mujoco.MjData(model)
-    data.qpos[:] = model.qpos0
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_camlight(model, data)
+    model, data = scene.mj_model, _data_at_qpos0(scene.mj_model)
     joints = kinematics.build_joints(model, data)
     cameras = kinematics.build_placement(model, data, "cam")
-    ids = np.asarray(scene.joint_ids)
-    chain = dataclasses.replace(
-        jax.tree.map(lambda leaf: leaf[ids], joints), parent=jnp.arange(len(ids), dtype=jnp.int32)
-    )
-    lower, upper, speed = _limits(scene)
-    is_limited, home = np.isfinite(lower), model.qpos0.copy()
-    home[is_limited] = 0.5 * (lower[is_limited] + upper[is_limited])
-    camera = scene.camera_id
-    geoms = collision.Geoms(scene.arm_geom_ids, scene.mount_geom_ids, scene.object_geom_ids, scene.obstacle_geom_ids)
+    lower, upper, speed = _joint_limits(scene)
+    pairs, planning_pairs = _build_collision_pairs(scene, data)
     return Arm(
         joints=joints,
-        chain=chain,
-        wrist=SE3.from_rotation_and_translation(
-            SO3.from_matrix(cameras.rotation[camera]), cameras.position[camera]
-        ).as_matrix(),
+        chain=_camera_chain(joints, scene.joint_ids),
+        wrist=_placement_matrix(cameras, scene.camera_id),
         bodies=kinematics.build_placement(model, data, "body"),
         geoms=kinematics.build_placement(model, data, "geom"),
         sites=kinematics.build_placement(model, data, "site"),
         cameras=cameras,
         lower=jnp.asarray(lower, jnp.float32),
         upper=jnp.asarray(upper, jnp.float32),
-        home=jnp.asarray(home, jnp.float32),
+        home=jnp.asarray(_home(model, lower, upper), jnp.float32),
         speed=jnp.asarray(speed, jnp.float32),
-        pairs=collision.build_pairs(model, data, geoms, scene.joint_ids, is_for_planning=False),
-        planning_pairs=collision.build_pairs(model, data, geoms, scene.joint_ids, is_for_planning=True),
+        pairs=pairs,
+        planning_pairs=planning_pairs,
         table_height=jnp.float32(scene.table_height),
         table_clearance=jnp.float32(scene.table_clearance),
         data=mjx.make_data(scene.mjx_model),
-        camera_id=camera,
+        camera_id=scene.camera_id,
         joints_without_speed=tuple(
             model.joint(j).name for j in scene.joint_ids if np.isnan(speed[model.jnt_qposadr[j]])
         ),
     )
 
 
-def _limits(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns lower and upper limits and speed limits, f64[nq] each; infinite or NaN where there are none."""
+def _data_at_qpos0(model: mujoco.MjModel) -> mujoco.MjData:
+    """Returns MuJoCo's data with the kinematics at `qpos0`, cameras included."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+    return data
+
+
+def _camera_chain(joints: Joints, joint_ids: tuple[int, ...]) -> Joints:
+    """Returns the joints `joint_ids` as a serial chain that starts at the world."""
+    ids = np.asarray(joint_ids)
+    chain = jax.tree.map(lambda leaf: leaf[ids], joints)
+    return dataclasses.replace(chain, parent=jnp.arange(len(ids), dtype=jnp.int32))
+
+
+def _placement_matrix(placement: Placement, index: int) -> Array:
+    """Returns f32[4, 4], the pose of item `index` in its frame."""
+    rotation = SO3.from_matrix(placement.rotation[index])
+    return SE3.from_rotation_and_translation(rotation, placement.position[index]).as_matrix()
+
+
+def _joint_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns lower limits, upper limits and speed limits, f64[nq] each; -inf, +inf and NaN where there are none."""
     model = scene.mj_model
     lower, upper, speed = (np.full(model.nq, value) for value in (-np.inf, np.inf, np.nan))
     for joint in range(model.njnt):
@@ -138,18 +148,42 @@ def _limits(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             lower[address], upper[address] = model.jnt_range[joint]
         elif joint in scene.joint_ids:
             raise SceneError(
-                f"joint {model.joint(joint).name!r} has no limits, so its values cannot be searched; give it a range"
+                f"joint {model.joint(joint).name!r} has no limits, but planning needs them; "
+                "give the joint a `range` in the arm's file"
             )
         if model.nuser_jnt and model.jnt_user[joint, 0] > 0:
             speed[address] = model.jnt_user[joint, 0]
     return lower, upper, speed
 
 
-def forward_kinematics(arm: Arm, qpos: Array) -> mjx.Data:
-    """Returns where everything is at `qpos` (f32[nq], rad or m).
+def _home(model: mujoco.MjModel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Returns f64[nq], the middle of the limits; `qpos0` for joints without limits."""
+    is_limited, home = np.isfinite(lower), model.qpos0.copy()
+    home[is_limited] = 0.5 * (lower[is_limited] + upper[is_limited])
+    return home
 
-    Filled are qpos, xpos, xmat, xanchor, xaxis, geom_xpos, geom_xmat, site_xpos, site_xmat, cam_xpos, cam_xmat; the
-    rest of the data (velocities, quaternions, inertias) is not. Equal to C MuJoCo to 1e-5.
+
+def _build_collision_pairs(scene: Scene, data: mujoco.MjData) -> tuple[collision.Pairs, collision.Pairs]:
+    """Returns all pairs of geoms that must not touch, and the pairs that planning checks."""
+    geoms = collision.Geoms(scene.arm_geom_ids, scene.mount_geom_ids, scene.object_geom_ids, scene.obstacle_geom_ids)
+    return (
+        collision.build_pairs(scene.mj_model, data, geoms, scene.joint_ids, is_for_planning=False),
+        collision.build_pairs(scene.mj_model, data, geoms, scene.joint_ids, is_for_planning=True),
+    )
+
+
+def forward_kinematics(arm: Arm, qpos: Array) -> mjx.Data:
+    """Computes the poses of all bodies, geoms, sites and cameras.
+
+    The result equals C MuJoCo to 1e-5.
+
+    Args:
+      arm: the arm.
+      qpos: f32[nq] rad or m.
+
+    Returns:
+      mjx.Data with these fields set: qpos, xpos, xmat, xanchor, xaxis, geom_xpos, geom_xmat, site_xpos, site_xmat,
+      cam_xpos, cam_xmat. All other fields (velocities, quaternions, inertias) keep the values of `arm.data`.
     """
     rotations, positions, axes, anchors = kinematics.frames(arm.joints, qpos[arm.joints.address])
     body_position, body_rotation = kinematics.place(arm.bodies, rotations, positions)
@@ -172,22 +206,30 @@ def forward_kinematics(arm: Arm, qpos: Array) -> mjx.Data:
 
 
 def camera_pose(arm: Arm, data: mjx.Data) -> SE3:
-    """Returns `T_world_camera` of the wrist camera from the data of `forward_kinematics`."""
+    """Returns the pose of the wrist camera.
+
+    Args:
+      arm: the arm.
+      data: from `forward_kinematics`.
+
+    Returns:
+      T_world_camera, translation in m.
+    """
     return SE3.from_rotation_and_translation(
         SO3.from_matrix(data.cam_xmat[arm.camera_id]), data.cam_xpos[arm.camera_id]
     )
 
 
 def camera_kinematics(arm: Arm, joint_values: Array) -> tuple[Array, Array, Array]:
-    """Returns position, rotation and Jacobian of the wrist camera; the part of the kinematics that IK repeats.
+    """Computes pose and Jacobian of the wrist camera. IK calls this function in each iteration.
 
     Args:
       arm: the arm.
-      joint_values: f32[J] rad or m, of the joints of `arm.chain`.
+      joint_values: f32[J] rad or m, values of the joints of `arm.chain`.
 
     Returns:
-      f32[3] m in world; f32[3, 3] camera to world; the geometric Jacobian f32[6, J] in world, linear rows (m) before
-      angular ones (rad) (Siciliano et al., Robotics, 3.1.3).
+      Position f32[3] m in world. Rotation f32[3, 3], camera to world. Geometric Jacobian f32[6, J] in world: three
+      linear rows (m), then three angular rows (rad) (Siciliano et al., Robotics, 3.1.3).
     """
     rotations, positions, axes, anchors = kinematics.frames(arm.chain, joint_values)
     rotation = kinematics.matmul(rotations[-1], arm.wrist[:3, :3])
@@ -199,19 +241,38 @@ def camera_kinematics(arm: Arm, joint_values: Array) -> tuple[Array, Array, Arra
 
 
 def clearance(arm: Arm, data: mjx.Data) -> Clearance:
-    """Returns how far the arm is from table, object and itself, from the data of `forward_kinematics`.
+    """Computes how far the arm is from the table, the object, the obstacles and itself.
 
-    Geoms that are no capsules count as the capsule around them on the arm, and as the box around them where the object
-    is a mesh; the distance is then on the safe side. Neighbours and excluded pairs are left out as MuJoCo does.
+    A geom of the arm that is not a capsule counts as its enclosing capsule. A mesh counts as its bounding box. These
+    solids contain the geom, so the true distance is never smaller. Neighbouring links and excluded pairs are ignored,
+    as in MuJoCo.
+
+    Args:
+      arm: the arm.
+      data: from `forward_kinematics`.
+
+    Returns:
+      Signed distances in m.
     """
     pairs = arm.pairs
     gap = collision.pair_distances(pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
-    parts = (collision.TABLE, collision.OBJECT, collision.SELF, collision.OBSTACLE)
-    table, target, own, obstacles = (collision.min_distance(pairs, gap, part) for part in parts)
-    return Clearance(table=table, object=target, self=own, obstacles=obstacles)
+    return Clearance(
+        table=collision.min_distance(pairs, gap, collision.TABLE),
+        object=collision.min_distance(pairs, gap, collision.OBJECT),
+        self=collision.min_distance(pairs, gap, collision.SELF),
+        obstacles=collision.min_distance(pairs, gap, collision.OBSTACLE),
+    )
 
 
 def is_free(arm: Arm, data: mjx.Data) -> Array:
-    """Returns bool[]: nothing touches, and the table's clearance is kept."""
+    """Checks that no pair touches and that the table clearance is kept.
+
+    Args:
+      arm: the arm.
+      data: from `forward_kinematics`.
+
+    Returns:
+      bool[], true where the arm is free.
+    """
     gap = collision.pair_distances(arm.pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
     return jnp.all(gap > jnp.where(arm.pairs.part == collision.TABLE, arm.table_clearance, 0.0))

@@ -1,8 +1,9 @@
-"""Frames of a tree of hinges and slides, by one scan over the joints.
+"""Forward kinematics of a tree of hinges and slides, by one scan over the joints.
 
-This fills the fields of `mjx.kinematics` from the model's own constants. It does not call that function: vmapped over
-64 configurations of the LWR and compiled for CPU (jax 0.9.2, mjx 3.17) it takes 0.14 s of processor time for each, this
-scan 2e-6 s. The likely reason: XLA fuses its unrolled chain of bodies and computes each body anew for every use of it.
+The results equal those of `mjx.kinematics`. That function is not used because it is slow under `vmap` on CPU. Measured
+with 64 configurations of the LWR, jax 0.9.2 and mjx 3.17: `mjx.kinematics` takes 0.14 s of processor time for each
+configuration, this scan takes 2e-6 s. The likely reason: XLA fuses the unrolled chain of bodies, and computes each body
+again for every use.
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ from vsearch_jax.xla.batching import append_axes
 
 @flax.struct.dataclass
 class Joints:
-    """Hinges and slides in the order of their parents; the frame of a joint has its origin on the axis.
+    """Hinges and slides; a parent comes before its children. The origin of a joint's frame lies on the joint's axis.
 
     Attributes:
-      parent: i32[J], frame that the joint hangs on: 0 is the world, j + 1 the frame of joint j.
-      position: f32[J, 3] m, origin in the parent's frame where the joint is at its reference.
-      rotation: f32[J, 3, 3], of the frame against the parent's there.
-      axis: f32[J, 3], unit vector in the frame.
-      is_slide: bool[J].
-      reference: f32[J] rad or m, value at which the model was drawn.
-      address: i32[J], place in qpos.
+      parent: i32[J], number of the frame that the joint hangs on. 0 is the world; j + 1 is the frame of joint j.
+      position: f32[J, 3] m, origin of the joint's frame in the parent's frame at the reference value.
+      rotation: f32[J, 3, 3], joint's frame to parent's frame at the reference value.
+      axis: f32[J, 3], unit vector of the axis in the joint's frame.
+      is_slide: bool[J], true for a slide, false for a hinge.
+      reference: f32[J] rad or m, joint value at which `position` and `rotation` hold.
+      address: i32[J], index of the joint's value in qpos.
     """
 
     parent: Array
@@ -44,12 +45,12 @@ class Joints:
 
 @flax.struct.dataclass
 class Placement:
-    """Things fixed to frames (bodies, geoms, sites or cameras).
+    """Where N bodies, geoms, sites or cameras are fixed.
 
     Attributes:
-      frame: i32[N], as in `Joints.parent`.
-      position: f32[N, 3] m in the frame.
-      rotation: f32[N, 3, 3] to the frame.
+      frame: i32[N], number of the frame, as in `Joints.parent`.
+      position: f32[N, 3] m, in the frame.
+      rotation: f32[N, 3, 3], item to frame.
     """
 
     frame: Array
@@ -58,56 +59,83 @@ class Placement:
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """Returns the product of `a` and `b` (f32[..., 3, 3]) as a sum: on CPU, XLA runs it faster than a batched dot."""
+    """Returns the matrix product f32[..., 3, 3], computed as a sum. On CPU this is faster than a batched dot.
+
+    Args:
+      a: f32[..., 3, 3].
+      b: f32[..., 3, 3].
+    """
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
 def rotate(rotation: Array, vector: Array) -> Array:
-    """Returns f32[..., 3], `vector` (f32[..., 3]) turned by `rotation` (f32[..., 3, 3]); both of the same rank."""
+    """Rotates vectors whose batch axes lead.
+
+    Args:
+      rotation: f32[..., 3, 3].
+      vector: f32[..., 3], with as many batch axes as `rotation`.
+
+    Returns:
+      f32[..., 3], `rotation` times `vector`.
+    """
     return jnp.sum(rotation * vector[..., None, :], axis=-1)
 
 
 def rotate_each(rotations: Array, vectors: Array) -> Array:
-    """Returns f32[N, 3, ...], `vectors` (f32[N, 3, ...]) turned by `rotations` (f32[N, 3, 3, ...]); see `frames`."""
+    """Rotates N vectors whose batch axes come last, the layout of `frames`.
+
+    Args:
+      rotations: f32[N, 3, 3, ...].
+      vectors: f32[N, 3, ...].
+
+    Returns:
+      f32[N, 3, ...], each rotation times its vector.
+    """
     return jnp.sum(rotations * vectors[:, None], axis=2)
 
 
 def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
-    """Returns rotations f32[J + 1, 3, 3] and origins f32[J + 1, 3] of world and joints, axes and anchors f32[J, 3].
-
-    All are in world; axes and anchors are MuJoCo's `xaxis` and `xanchor`.
+    """Computes the frames of all joints in world.
 
     Args:
       joints: the J joints.
-      values: f32[J] rad or m, of the joints; they may have a batch axis more at the end, then the results have it too.
+      values: f32[J] rad or m, one value for each joint. A batch axis at the end is allowed; the results then have it
+        at the end, too.
+
+    Returns:
+      Rotations f32[J + 1, 3, 3], frame to world, and origins f32[J + 1, 3] m of the frames; row 0 is the world's frame.
+      Axes f32[J, 3], MuJoCo's `xaxis`, and anchors f32[J, 3] m, MuJoCo's `xanchor`.
     """
-    count, wide = joints.parent.shape[0], functools.partial(append_axes, count=values.ndim - 1)
-    axis, is_slide, rotation = wide(joints.axis), wide(joints.is_slide), wide(joints.rotation)
-    change = values - wide(joints.reference)
+    num_joints, expand = joints.parent.shape[0], functools.partial(append_axes, count=values.ndim - 1)
+    axis, is_slide, rotation = expand(joints.axis), expand(joints.is_slide), expand(joints.rotation)
+    change = values - expand(joints.reference)
     angle, offset = jnp.where(is_slide, 0.0, change), jnp.where(is_slide, change, 0.0)
-    # In the frames of the parents, all at once; what is left for the scan is to chain them.
+    # The poses relative to the parents need no scan. Only their chaining does.
     shift = rotate_each(rotation, axis) * offset[:, None]
-    turned = jnp.sum(rotation[:, :, :, None] * _axis_rotations(axis, angle)[:, None], axis=2)
+    local_rotation = jnp.sum(rotation[:, :, :, None] * _axis_rotations(axis, angle)[:, None], axis=2)
     start = (
-        jnp.broadcast_to(wide(jnp.eye(3)), (count + 1, *turned.shape[1:])),
-        jnp.zeros((count + 1, *turned.shape[2:])),
+        jnp.broadcast_to(expand(jnp.eye(3)), (num_joints + 1, *local_rotation.shape[1:])),
+        jnp.zeros((num_joints + 1, *local_rotation.shape[2:])),
     )
-    steps = (joints.parent, turned, wide(joints.position) + shift, jnp.arange(1, count + 1))
-    (rotations, positions), _ = jax.lax.scan(_next_frame, start, steps)
+    steps = (joints.parent, local_rotation, expand(joints.position) + shift, jnp.arange(1, num_joints + 1))
+    (rotations, positions), _ = jax.lax.scan(_append_frame, start, steps)
     axes = rotate_each(rotations[1:], axis)
     return rotations, positions, axes, positions[1:] - axes * offset[:, None]
 
 
-def _next_frame(done: tuple[Array, Array], step: tuple[Array, Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
-    (rotations, positions), (parent, turned, position, index) = done, step
-    outer = rotations[parent]
-    rotation = jnp.sum(outer[:, :, None] * turned[None], axis=1)
-    position = positions[parent] + jnp.sum(outer * position[None], axis=1)
+def _append_frame(
+    world_frames: tuple[Array, Array], step: tuple[Array, Array, Array, Array]
+) -> tuple[tuple[Array, Array], None]:
+    """Computes one joint's frame in world from its parent's frame; a scan step."""
+    (rotations, positions), (parent, local_rotation, local_position, index) = world_frames, step
+    parent_rotation = rotations[parent]
+    rotation = jnp.sum(parent_rotation[:, :, None] * local_rotation[None], axis=1)
+    position = positions[parent] + jnp.sum(parent_rotation * local_position[None], axis=1)
     return (rotations.at[index].set(rotation), positions.at[index].set(position)), None
 
 
 def _axis_rotations(axis: Array, angle: Array) -> Array:
-    """Rodrigues' formula; f32[J, 3, 3, ...] from f32[J, 3, ...] and f32[J, ...]."""
+    """Returns f32[J, 3, 3, ...] from f32[J, 3, ...] and f32[J, ...] rad, by Rodrigues' formula."""
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     zero = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack(row, axis=1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=1)
@@ -116,14 +144,24 @@ def _axis_rotations(axis: Array, angle: Array) -> Array:
     return cosine * append_axes(jnp.eye(3)[None], angle.ndim - 1) + sine * cross + (1.0 - cosine) * outer
 
 
-def place(things: Placement, rotations: Array, positions: Array) -> tuple[Array, Array]:
-    """Returns positions f32[N, 3] m and rotations f32[N, 3, 3] in world, from those of the frames (see `frames`)."""
-    rotation = rotations[things.frame]
-    return positions[things.frame] + rotate(rotation, things.position), matmul(rotation, things.rotation)
+def place(placement: Placement, rotations: Array, positions: Array) -> tuple[Array, Array]:
+    """Computes the world poses of bodies, geoms, sites or cameras.
+
+    Args:
+      placement: the N items.
+      rotations: f32[J + 1, 3, 3], from `frames`.
+      positions: f32[J + 1, 3] m, from `frames`.
+
+    Returns:
+      Positions f32[N, 3] m and rotations f32[N, 3, 3], item to world.
+    """
+    rotation = rotations[placement.frame]
+    position = positions[placement.frame] + rotate(rotation, placement.position)
+    return position, matmul(rotation, placement.rotation)
 
 
 def _body_frames(model: mujoco.MjModel) -> np.ndarray:
-    """Returns i32[nbody]: the frame of the last joint that moves the body."""
+    """Returns i32[nbody], for each body the number of the frame that it is fixed to."""
     frame = np.zeros(model.nbody, dtype=np.int32)
     for body in range(1, model.nbody):
         first, count = model.body_jntadr[body], model.body_jntnum[body]
@@ -132,17 +170,23 @@ def _body_frames(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _frame_poses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+    """Returns rotations f64[J + 1, 3, 3] and origins f64[J + 1, 3] m of the world and the joints, in world."""
     rotations = np.concatenate([np.eye(3)[None], data.xmat.reshape(-1, 3, 3)[model.jnt_bodyid]])
     return rotations, np.concatenate([np.zeros((1, 3)), data.xanchor])
 
 
 def build_joints(model: mujoco.MjModel, data: mujoco.MjData) -> Joints:
-    """Returns the joints of `model`, all hinges or slides; `data` holds its kinematics at `qpos0`."""
+    """Returns all joints of a model.
+
+    Args:
+      model: a model whose joints are hinges or slides.
+      data: its kinematics at `qpos0`.
+    """
     body_frame = _body_frames(model)
     rotations, positions = _frame_poses(model, data)
     is_first = np.arange(model.njnt) == model.body_jntadr[model.jnt_bodyid]
-    above = body_frame[model.body_parentid[model.jnt_bodyid]]
-    parent = np.where(is_first, above, np.arange(model.njnt)).astype(np.int32)
+    frame_of_parent_body = body_frame[model.body_parentid[model.jnt_bodyid]]
+    parent = np.where(is_first, frame_of_parent_body, np.arange(model.njnt)).astype(np.int32)
     inverse = np.swapaxes(rotations[parent], -1, -2)
     offset = positions[1:] - positions[parent]
     return Joints(
@@ -157,7 +201,13 @@ def build_joints(model: mujoco.MjModel, data: mujoco.MjData) -> Joints:
 
 
 def build_placement(model: mujoco.MjModel, data: mujoco.MjData, kind: str) -> Placement:
-    """Returns where things of a `kind` are fixed: "body", "geom", "site" or "cam"; `data` as for `build_joints`."""
+    """Returns where the elements of one kind are fixed.
+
+    Args:
+      model: a model whose joints are hinges or slides.
+      data: its kinematics at `qpos0`.
+      kind: "body", "geom", "site" or "cam".
+    """
     body_frame = _body_frames(model)
     if kind == "body":
         frame, position, rotation = body_frame, data.xpos, data.xmat

@@ -1,4 +1,4 @@
-"""One MuJoCo model out of table, lights, mount, an arm that hangs from the mount, and an object to look at."""
+"""Builds one MuJoCo model from a table, lights, a mount, an arm that hangs from the mount, an object and obstacles."""
 
 from vsearch_jax.scene.assembly import Scene, build_scene
 from vsearch_jax.scene.files import SceneError, available, xml_folder

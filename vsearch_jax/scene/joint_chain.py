@@ -6,7 +6,7 @@ import mujoco
 
 
 def joints_above(model: mujoco.MjModel, body: int) -> list[int]:
-    """Returns the numbers of the joints that move a body, from the world outward.
+    """Returns MuJoCo's numbers of the joints that move a body, from the world outward.
 
     Args:
       model: the compiled model.

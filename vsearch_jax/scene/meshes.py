@@ -1,4 +1,4 @@
-"""Mesh files: read, inspected, and refused where nothing could be seen of them."""
+"""Reads and checks mesh files."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ import numpy as np
 import trimesh
 
 MESH_SUFFIXES = (".obj", ".stl", ".msh", ".ply", ".glb", ".gltf", ".off")
-# A file of these suffixes is MuJoCo's own to read, so that normals and texture coordinates stay.
+# MuJoCo reads these files itself, which keeps normals and texture coordinates.
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 
-# The least size of an object, in m, of which a camera at arm's length shows more than a few pixels.
-_LEAST_SIZE = 0.005
+# m. A smaller object covers only a few pixels of the wrist camera's image.
+_MIN_SIZE = 0.005
 
 
 class MeshError(ValueError):
-    """A mesh file cannot be used; the one-line message names the problem and the remedy."""
+    """A mesh file cannot be used. The message has one line; it names the problem and the remedy."""
 
 
 @dataclass(frozen=True)
 class MeshReport:
-    """What a mesh is like.
+    """Size and faults of a mesh.
 
     Attributes:
-      num_faces: triangles.
-      num_degenerate: triangles without area.
-      num_open_edges: edges that belong to one triangle only: the rims of holes.
-      size: f64[3] in the file's unit, edges of the bounding box.
+      num_faces: number of triangles.
+      num_degenerate: number of triangles without area.
+      num_open_edges: number of edges that belong to exactly one triangle; they bound the holes.
+      size: f64[3], edges of the bounding box, in the unit of the vertices.
     """
 
     num_faces: int
@@ -37,7 +37,7 @@ class MeshReport:
     size: np.ndarray
 
     def __str__(self) -> str:
-        """Returns one line."""
+        """Returns the report in one line."""
         faults = [f"{self.num_degenerate} of them without area"] if self.num_degenerate else []
         faults += [f"{self.num_open_edges} edges at holes"] if self.num_open_edges else []
         extent = " x ".join(f"{edge:.3g}" for edge in self.size)
@@ -45,61 +45,76 @@ class MeshReport:
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Returns vertices f64[V, 3] and faces i32[F, 3] of a file, all its parts in one.
+    """Returns vertices f64[V, 3] and faces i32[F, 3] of a mesh file. All parts of the file are merged.
 
     Raises:
-      MeshError: the file cannot be read or holds no triangle.
+      MeshError: the file cannot be read, or has no triangle.
     """
     try:
         mesh = trimesh.load_mesh(path)
         mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
-    except Exception as error:  # trimesh raises whatever its many readers do
-        raise MeshError(f"it cannot be read as a mesh ({' '.join(str(error).split())}); export it anew") from error
+    except Exception as error:  # The readers of trimesh raise exceptions of many types.
+        raise MeshError(f"it is not a readable mesh ({' '.join(str(error).split())}); export it again") from error
     if not len(faces):
-        raise MeshError("it holds no triangle; export the surface, not points or lines")
+        raise MeshError("it has no triangle; export a surface, not points or lines")
     return vertices, faces
 
 
-def inspect(vertices: np.ndarray, faces: np.ndarray) -> MeshReport:
-    """Returns what a mesh with `vertices` [V, 3] and `faces` [F, 3] is like; vertices in one place count as one."""
-    places, index = np.unique(vertices, axis=0, return_inverse=True)
+def inspect_mesh(vertices: np.ndarray, faces: np.ndarray) -> MeshReport:
+    """Counts the faults of a mesh. Vertices at equal positions count as one vertex.
+
+    Args:
+      vertices: f64[V, 3] in any unit.
+      faces: i32[F, 3], indices of vertices.
+
+    Returns:
+      The report.
+    """
+    positions, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]
-    a, b, c = (places[faces[:, i]] for i in range(3))
-    is_degenerate = np.linalg.norm(np.cross(b - a, c - a), axis=-1) <= 1e-12 * np.square(np.ptp(places, axis=0)).sum()
+    a, b, c = (positions[faces[:, i]] for i in range(3))
+    double_area = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+    is_degenerate = double_area <= 1e-12 * np.square(np.ptp(positions, axis=0)).sum()
     good = faces[~is_degenerate]
     edges = np.sort(np.concatenate([good[:, [0, 1]], good[:, [1, 2]], good[:, [2, 0]]]), axis=1)
-    _, uses = np.unique(edges, axis=0, return_counts=True)
-    return MeshReport(len(faces), int(is_degenerate.sum()), int((uses == 1).sum()), np.ptp(vertices, axis=0))
+    _, num_uses = np.unique(edges, axis=0, return_counts=True)
+    return MeshReport(len(faces), int(is_degenerate.sum()), int((num_uses == 1).sum()), np.ptp(vertices, axis=0))
 
 
-def check(vertices: np.ndarray, faces: np.ndarray, largest: float) -> MeshReport:
-    """Returns the report of a mesh that can be looked at.
+def check_mesh(vertices: np.ndarray, faces: np.ndarray, max_size: float) -> MeshReport:
+    """Checks that a mesh can be seen by the wrist camera.
 
     Args:
       vertices: f64[V, 3] m.
-      faces: i32[F, 3].
-      largest: m, the longest edge of a bounding box that can be looked at.
+      faces: i32[F, 3], indices of vertices.
+      max_size: m, maximum length of the longest edge of the bounding box.
+
+    Returns:
+      The report of the mesh.
 
     Raises:
-      MeshError: coordinates are not finite, all faces lack area, or the size fits no unit that is metres.
+      MeshError: a coordinate is not finite, all faces lack area, or the mesh is too large or too small.
     """
     if not np.isfinite(vertices).all():
         raise MeshError("it has vertices that are not finite; repair it")
-    report = inspect(vertices, faces)
+    report = inspect_mesh(vertices, faces)
     if report.num_degenerate == report.num_faces:
-        raise MeshError(f"all its {report.num_faces} faces lack area; export it anew")
+        raise MeshError(f"all its {report.num_faces} faces lack area; export it again")
     size = float(report.size.max())
-    if size > largest:
+    if size > max_size:
         raise MeshError(
-            f"it is {size:.3g} m long, and {largest:.3g} m can be looked at; "
-            "if its unit is millimetres, set SceneConfig.mesh_scale to 0.001"
+            f"it is {size:.3g} m long, but the maximum is {max_size:.3g} m; "
+            "if its unit is millimetres, set SceneConfig.mesh_scale (--scene.mesh-scale) to 0.001"
         )
-    if size < _LEAST_SIZE:
-        raise MeshError(f"it is {size:.3g} m long, less than {_LEAST_SIZE} m; set SceneConfig.mesh_scale")
+    if size < _MIN_SIZE:
+        raise MeshError(
+            f"it is {size:.3g} m long, but the minimum is {_MIN_SIZE} m; "
+            "set SceneConfig.mesh_scale (--scene.mesh-scale) to the length of its unit in metres"
+        )
     return report
 
 
 def is_read_by_mujoco(path: Path) -> bool:
-    """Returns whether MuJoCo reads files of this kind."""
+    """Returns whether MuJoCo reads files with the suffix of `path`."""
     return path.suffix.lower() in _READ_BY_MUJOCO

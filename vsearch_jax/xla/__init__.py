@@ -1,1 +1,1 @@
-"""What XLA needs and the mathematics does not: lane pool, batch layout, fusion boundary, vectors by coordinate."""
+"""Tools that make XLA programs fast: lane pool, batch layout, fusion boundary, operations on pytrees and vectors."""

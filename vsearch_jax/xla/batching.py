@@ -17,13 +17,13 @@ Results = TypeVar("Results")
 def map_in_batches(function: Callable[[Items], Results], items: Items, batch_size: int) -> Results:
     """Maps `function` over the leading axis, `batch_size` items at a time.
 
-    `jax.lax.map` compiles a second program where the batches do not divide the items. This function repeats the last
-    item instead, so it compiles one.
+    If `batch_size` does not divide the number of items, `jax.lax.map` compiles a second program for the remainder. This
+    function repeats the last item instead, so one program is enough.
 
     Args:
       function: maps one item to one result.
       items: pytree, leading axis N.
-      batch_size: items of a batch; limited to 1 to N.
+      batch_size: number of items in a batch; limited to the range 1 to N.
 
     Returns:
       Pytree of results, leading axis N.
@@ -36,9 +36,9 @@ def map_in_batches(function: Callable[[Items], Results], items: Items, batch_siz
 
 
 def flatten_vmap(function: Callable[[Shared, Items], Results]) -> Callable[[Shared, Items], Results]:
-    """Makes `vmap` of a batched function call it once with a larger batch.
+    """Makes `vmap` of a batched function call the function once, with a larger batch.
 
-    Without it, `vmap` of a function that loops over a batch gives a loop inside a loop.
+    Use it for functions that loop over their batch. Plain `vmap` would put a loop inside a loop.
 
     Args:
       function: (shared, items with leading axis N) -> results with leading axis N.
@@ -61,7 +61,7 @@ def flatten_vmap(function: Callable[[Shared, Items], Results]) -> Callable[[Shar
 def batch_axis_last(function: Callable[[Shared, Items], Results]) -> Callable[[Shared, Items], Results]:
     """Makes `vmap` of a function put the batch axis last.
 
-    XLA on CPU vectorises over a last batch axis, and gathers whole rows.
+    On CPU, XLA vectorises over the last axis. With the batch there, a gather also copies whole rows.
 
     Args:
       function: (shared, items) -> results. It must also accept items whose arrays have one more axis at the end, and
@@ -81,7 +81,7 @@ def batch_axis_last(function: Callable[[Shared, Items], Results]) -> Callable[[S
 def _with_vmap_rule(
     function: Callable[[Shared, Items], Results], run_batch: Callable[[Shared, Items], Results]
 ) -> Callable[[Shared, Items], Results]:
-    """Returns `function` with `run_batch` as its batching rule; items that are not mapped are repeated."""
+    """Returns `function` with `run_batch` as its batching rule. Items without a batch axis are repeated."""
     batched = jax.custom_batching.custom_vmap(function)
 
     @batched.def_vmap
@@ -102,5 +102,10 @@ def _with_vmap_rule(
 
 
 def append_axes(leaf: Array, count: int) -> Array:
-    """Returns `leaf` with `count` axes of length 1 at the end, to broadcast with arrays whose batch axes are last."""
+    """Returns `leaf` with axes of length 1 at the end, so that it broadcasts with arrays whose batch axes are last.
+
+    Args:
+      leaf: array of any shape.
+      count: number of axes to append.
+    """
     return leaf.reshape(*leaf.shape, *[1] * count)

@@ -18,14 +18,15 @@ State = TypeVar("State")
 Result = TypeVar("Result")
 Tree = TypeVar("Tree")
 
-# Lanes are refilled once a 1/8 of the busy ones has finished. A refill costs about as much as a few steps.
+# Lanes are refilled once 1/8 of the busy lanes have finished. A refill costs about as much as a few steps.
 REFILL_SHARE = 8
-# When the queue is empty, a 1/4 of the lanes continues alone, and then a 1/4 of those. Idle lanes cost as much as busy.
+# An idle lane costs as much as a busy lane. So when the queue is empty, the last problems move to 1/4 of the lanes, and
+# later to 1/4 of those.
 TAIL_SHARES = (4, 4)
 
 
 class Job(NamedTuple, Generic[Problem, State, Result]):
-    """What a lane does. Each function handles one item.
+    """The functions that a lane runs. Each function handles one item.
 
     Attributes:
       reset: (problem, state, is_new bool[]) -> state. Returns the start state of `problem` where `is_new`, else the
@@ -48,8 +49,8 @@ class Queue(NamedTuple):
     """Which of N problems to run, and in which order.
 
     Attributes:
-      order: i32[N], numbers of the problems; those to run come first.
-      num_queued: i32[], how many of them to run.
+      order: i32[N], numbers of the problems; the problems to run come first.
+      num_queued: i32[], number of problems to run.
     """
 
     order: Array
@@ -62,7 +63,7 @@ class _Run(NamedTuple, Generic[State, Result]):
     Attributes:
       states: the lanes' states, leading axis L.
       held: i32[L], number of the problem that each lane holds; N where it is idle.
-      head: i32[], place in the queue of the next problem.
+      head: i32[], index in the queue of the next problem.
       results: pytree, leading axis N.
     """
 
@@ -73,7 +74,7 @@ class _Run(NamedTuple, Generic[State, Result]):
 
 
 def queue_where(is_wanted: Array) -> Queue:
-    """Returns the queue of the problems where `is_wanted` (bool[N]), in ascending order."""
+    """Returns a queue of the problems with true `is_wanted` (bool[N]), in ascending order."""
     return Queue(jnp.argsort(~is_wanted).astype(jnp.int32), jnp.sum(is_wanted, dtype=jnp.int32))
 
 
@@ -81,11 +82,11 @@ def run(job: Job[Problem, State, Result], problems: Problem, queue: Queue, state
     """Runs the queued problems.
 
     Args:
-      job: what to do.
+      job: the functions to run.
       problems: pytree, leading axis N.
       queue: which problems to run.
-      states: pytree, leading axis L, the lanes. Their content is overwritten.
-      results: pytree, leading axis N, as `job.result` returns them.
+      states: pytree, leading axis L, one state for each lane. The values are overwritten.
+      results: pytree, leading axis N, of the structure that `job.result` returns.
 
     Returns:
       `results` with the rows of the queued problems replaced.
@@ -144,4 +145,5 @@ def _refill(
 
 
 def _rows(tree: Tree, index: Array) -> Tree:
+    """Returns the rows `index` of each leaf. An index after the last row returns the last row."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(index, leaf.shape[0] - 1)], tree)

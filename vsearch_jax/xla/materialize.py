@@ -33,7 +33,7 @@ def materialize(tree: Tree, zero: Array) -> Tree:
       zero: i32[], 0 at run time. Must not be a compile-time constant; see `runtime_zero`.
 
     Returns:
-      The same values. Derivatives pass through.
+      `tree`. Derivatives pass through unchanged.
     """
     return jax.lax.while_loop(_has_next, _change_all, (jnp.zeros_like(zero), zero, tree))[2]
 
@@ -44,7 +44,7 @@ def _materialize_jvp(primals: tuple[Tree, Array], tangents: tuple[Tree, Array]) 
 
 
 def runtime_zero(values: Array) -> Array:
-    """Returns i32[] 0, computed so that the compiler cannot know its value.
+    """Returns 0 as i32[]. It is computed at run time, so the compiler cannot know its value.
 
     Args:
       values: f32 of any shape. Must not be a compile-time constant.

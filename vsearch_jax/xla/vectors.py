@@ -12,5 +12,10 @@ Vector = tuple[Array, Array, Array]
 
 
 def dot(a: Vector, b: Vector) -> Array:
-    """Returns the inner product of `a` and `b`."""
+    """Returns the inner product of two vectors, an array of the coordinates' shape.
+
+    Args:
+      a: x, y and z of the first vector.
+      b: x, y and z of the second vector.
+    """
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,7 +1,7 @@
-"""How far the solids of each pair are from one another.
+"""Signed distances of all pairs in `Pairs`.
 
-From a capsule's axis to another, to a box or to a cylinder there are forms without a loop. From an ellipsoid the
-distance is minimised over the axis; it is convex there, so a golden section finds it.
+The distance between a capsule's axis and another axis, a box or a cylinder takes a fixed number of operations. The
+distance from an ellipsoid is convex along the axis; golden-section search finds its minimum.
 """
 
 from __future__ import annotations
@@ -22,85 +22,117 @@ from vsearch_jax.xla.vectors import Vector, dot
 
 
 class Axes(NamedTuple):
-    """Axes of C capsules in world: their middles, Vector of f32[C] m, and from there to one end, Vector of f32[C] m."""
+    """Axes of C capsules in world.
+
+    Attributes:
+      center: Vector of f32[C] m, midpoints of the axes.
+      half_axis: Vector of f32[C] m, vectors from the midpoint to one end.
+    """
 
     center: Vector
     half_axis: Vector
 
 
 def pair_distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> Array:
-    """Returns the signed distance f32[N] in m of each pair, from the poses of the geoms.
+    """Computes the distance of each pair from the poses of the geoms.
 
-    A capsule whose axis passes through a box or a cylinder is minus its radius away, however deep it is.
+    The penetration of a box or a cylinder is not measured: if the axis intersects the solid, the distance is minus the
+    capsule's radius.
 
     Args:
-      pairs: what must not touch.
-      geom_xpos: f32[ngeom, 3] m in world.
-      geom_xmat: f32[ngeom, 3, 3] to world.
+      pairs: the N pairs that must not touch.
+      geom_xpos: f32[ngeom, 3] m, in world.
+      geom_xmat: f32[ngeom, 3, 3], geom to world.
       table_height: f32[] m, world z.
+
+    Returns:
+      f32[N] m, signed.
     """
     rotation = geom_xmat[pairs.geom]
-    middle = primitives.rotate(rotation, primitives.coordinates(pairs.center))
-    center = primitives.add_scaled(middle, jnp.ones_like(pairs.radius), primitives.coordinates(geom_xpos[pairs.geom]))
-    return distances_from_axes(
-        pairs, Axes(center, primitives.rotate(rotation, primitives.coordinates(pairs.half_axis))), table_height
-    )
+    offset = primitives.rotate(rotation, primitives.coordinates(pairs.center))
+    center = primitives.add_scaled(offset, jnp.ones_like(pairs.radius), primitives.coordinates(geom_xpos[pairs.geom]))
+    half_axis = primitives.rotate(rotation, primitives.coordinates(pairs.half_axis))
+    return distances_from_axes(pairs, Axes(center, half_axis), table_height)
 
 
 def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
-    """Returns the axes of the capsules from the frames of the joints; see `kinematics.frames`, also for batches."""
+    """Computes the axes of the C capsules from the frames of the joints.
+
+    Args:
+      pairs: the pairs that must not touch.
+      rotations: f32[J + 1, 3, 3], frame to world, from `kinematics.frames`. A batch axis at the end is allowed.
+      positions: f32[J + 1, 3] m, in world, from `kinematics.frames`. A batch axis at the end is allowed.
+
+    Returns:
+      Axes in world, with the batch axis at the end.
+    """
     frame = pairs.placement.frame
-    wide = functools.partial(append_axes, count=positions.ndim - 2)
+    expand = functools.partial(append_axes, count=positions.ndim - 2)
     rotation = rotations[frame]
-    center = positions[frame] + rotate_each(rotation, wide(pairs.placement.position))
-    half_axis = rotate_each(rotation, wide(pairs.frame_half_axis))
+    center = positions[frame] + rotate_each(rotation, expand(pairs.placement.position))
+    half_axis = rotate_each(rotation, expand(pairs.frame_half_axis))
     return Axes((center[:, 0], center[:, 1], center[:, 2]), (half_axis[:, 0], half_axis[:, 1], half_axis[:, 2]))
 
 
 def distances_from_axes(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
-    """Returns what `pair_distances` does, from the axes of the capsules; these may have a batch axis more at the end."""
+    """Computes the distance of each pair from the axes of the capsules; see `pair_distances`.
+
+    Args:
+      pairs: the N pairs that must not touch.
+      axes: axes of the capsules, from `capsule_axes`. A batch axis at the end is allowed.
+      table_height: f32[] m, world z.
+
+    Returns:
+      f32[N] m, signed, with the batch axis at the end.
+    """
     center, half_axis = axes
-    wide = functools.partial(append_axes, count=center[0].ndim - 1)
-    radius = wide(pairs.radius)
+    expand = functools.partial(append_axes, count=center[0].ndim - 1)
+    radius = expand(pairs.radius)
     lowest = center[2] - jnp.abs(half_axis[2]) - radius
     first, second = pairs.first, pairs.second
-    apart = primitives.segment_distance(*(_rows(v, i) for i in (first, second) for v in (center, half_axis)))
+    axis_distance = primitives.segment_distance(*(_rows(v, i) for i in (first, second) for v in (center, half_axis)))
     solids = (pairs.boxes, pairs.cylinders, pairs.ellipsoids)
-    sizes = [jax.tree.map(wide, primitives.coordinates(kind.size)) for kind in solids]
-    local = [_in_frames(kind, axes, wide) for kind in solids]
-    from_solids = (
-        primitives.segment_box_distance(*local[0], sizes[0]),
-        primitives.segment_cylinder_distance(*local[1], *sizes[1][:2]),
-        primitives.least_along(lambda point: primitives.ellipsoid_distance(point, sizes[2]), *local[2]),
+    sizes = [jax.tree.map(expand, primitives.coordinates(kind.size)) for kind in solids]
+    local_axes = [_axes_in_solid_frames(kind, axes, expand) for kind in solids]
+    solid_distances = (
+        primitives.segment_box_distance(*local_axes[0], sizes[0]),
+        primitives.segment_cylinder_distance(*local_axes[1], *sizes[1][:2]),
+        primitives.min_along_segment(lambda point: primitives.ellipsoid_distance(point, sizes[2]), *local_axes[2]),
     )
     return jnp.concatenate(
         [
             lowest[pairs.table] - table_height,
-            apart - radius[first] - radius[second],
-            *(distance - radius[kind.capsule] for distance, kind in zip(from_solids, solids, strict=True)),
+            axis_distance - radius[first] - radius[second],
+            *(distance - radius[kind.capsule] for distance, kind in zip(solid_distances, solids, strict=True)),
         ]
     )
 
 
-def _in_frames(solids: Solids, axes: Axes, wide: Callable[[Array], Array]) -> Axes:
-    """Returns the axes of the capsules in the frames of the solids."""
-    columns = jax.tree.map(wide, [primitives.coordinates(solids.rotation[:, :, i]) for i in range(3)])
-    offset = primitives.subtract(
-        _rows(axes.center, solids.capsule), jax.tree.map(wide, primitives.coordinates(solids.position))
-    )
+def _axes_in_solid_frames(solids: Solids, axes: Axes, expand: Callable[[Array], Array]) -> Axes:
+    """Returns the axis of each capsule in the frame of its solid. `expand` appends the batch axis."""
+    columns = [primitives.coordinates(solids.rotation[:, :, i]) for i in range(3)]
+    x_axis, y_axis, z_axis = jax.tree.map(expand, columns)
+    center = _rows(axes.center, solids.capsule)
+    offset = primitives.subtract(center, jax.tree.map(expand, primitives.coordinates(solids.position)))
     half_axis = _rows(axes.half_axis, solids.capsule)
-    first, second, third = columns
 
-    def turned(vector: Vector) -> Vector:
-        return dot(first, vector), dot(second, vector), dot(third, vector)
+    def to_solid_frame(vector: Vector) -> Vector:
+        return dot(x_axis, vector), dot(y_axis, vector), dot(z_axis, vector)
 
-    return Axes(turned(offset), turned(half_axis))
+    return Axes(to_solid_frame(offset), to_solid_frame(half_axis))
 
 
 def min_distance(pairs: Pairs, gap: Array, part: int) -> Array:
-    """Returns the least of the distances `gap` (f32[N]) from one part, f32[] m; +inf where there is nothing."""
+    """Returns the minimum distance f32[] in m from one part; +inf if no pair belongs to the part.
+
+    Args:
+      pairs: the N pairs.
+      gap: f32[N] m, their distances.
+      part: TABLE, OBJECT, SELF or OBSTACLE.
+    """
     return jnp.min(jnp.where(pairs.part == part, gap, jnp.inf), initial=jnp.inf)
 
 
 def _rows(vector: Vector, index: Array) -> Vector:
+    """Returns the rows `index` of each coordinate."""
     return vector[0][index], vector[1][index], vector[2][index]

@@ -1,4 +1,7 @@
-"""Bounds on how far the joints can move a geom: what makes a step between two configurations safe to take unseen."""
+"""Upper bounds on how far the joints can move a geom.
+
+Planning uses them to prove that nothing touches between two configurations.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +17,19 @@ SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def lever_arms(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[int, ...]) -> np.ndarray:
-    """Returns f64[ngeom, J]: most metres that any point of a geom moves for a unit (rad or m) of each of the `joints`.
+    """Computes how fast each joint can move each geom.
 
-    It is 0 for a joint that does not move the geom, 1 for a slide. For a hinge it is the farthest that the geom gets
-    from the axis, bounded by the triangle inequality over the anchors of the joints between.
+    The lever arm of a joint that does not move the geom is 0. The lever arm of a slide is 1. The lever arm of a hinge
+    is the maximum distance of the geom from the axis over all configurations. It is bounded by the triangle inequality
+    over the anchors of the joints between the hinge and the geom.
 
     Args:
-      model: the model, of hinges and slides in the branches that `joints` move.
+      model: the model. The bodies that `joints` move have only hinges and slides.
       data: its kinematics at `qpos0`.
-      joints: numbers of the joints.
+      joints: MuJoCo's numbers of the J joints.
+
+    Returns:
+      f64[ngeom, J], upper bound of the motion in m of any point of the geom, for each unit (rad or m) of the joint.
     """
     levers = np.zeros((model.ngeom, len(joints)))
     column = {joint: i for i, joint in enumerate(joints)}
@@ -31,54 +38,64 @@ def lever_arms(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[int, ..
         for i, joint in enumerate(chain):
             if joint in column:
                 is_slide = model.jnt_type[joint] == SLIDE
-                levers[geom, column[joint]] = 1.0 if is_slide else _reach(model, data, geom, chain[i:])
+                levers[geom, column[joint]] = 1.0 if is_slide else _max_axis_distance(model, data, geom, chain[i:])
     return levers
 
 
 def extent_from_still_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.ndarray, float]:
-    """Returns a point f64[3] m in world that no joint moves, and the farthest in m that any of `geom` gets from it."""
+    """Finds a ball that contains a geom in every configuration.
+
+    Args:
+      model: the model. The geom is moved by one joint or more, all hinges or slides.
+      data: its kinematics at `qpos0`.
+      geom: MuJoCo's number of the geom.
+
+    Returns:
+      f64[3] m, the ball's centre in world, a point that no joint moves. The ball's radius in m.
+    """
     chain = joints_above(model, int(model.geom_bodyid[geom]))
     while len(chain) > 1 and model.jnt_type[chain[0]] == HINGE:
-        if _from_axis(data, chain[0], data.xanchor[chain[1]]) > 1e-9:
+        if _axis_distance(data, chain[0], data.xanchor[chain[1]]) > 1e-9:
             break
-        chain = chain[1:]  # the next anchor lies on the axis, so it stays where it is
-    return data.xanchor[chain[0]], _travel(model, data, chain[:1]) + _spread(model, data, geom, chain)
+        chain = chain[1:]  # The hinge does not move the next anchor, which lies on its axis.
+    return data.xanchor[chain[0]], _max_slide(model, chain[:1]) + _max_anchor_distance(model, data, geom, chain)
 
 
-def _reach(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]) -> float:
-    """Returns the farthest in m that any point of `geom` gets from the axis of the first joint of `chain`."""
+def _max_axis_distance(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]) -> float:
+    """Returns an upper bound in m of the distance of any point of `geom` from the axis of the first joint."""
     if len(chain) == 1:
-        points, radius = _hull(model, data, geom)
-        return max(_from_axis(data, chain[0], point) for point in points) + radius
+        points, radius = _enclosing_balls(model, data, geom)
+        return max(_axis_distance(data, chain[0], point) for point in points) + radius
     return (
-        _from_axis(data, chain[0], data.xanchor[chain[1]])
-        + _spread(model, data, geom, chain[1:])
-        + _travel(model, data, chain[1:2])
+        _axis_distance(data, chain[0], data.xanchor[chain[1]])
+        + _max_anchor_distance(model, data, geom, chain[1:])
+        + _max_slide(model, chain[1:2])
     )
 
 
-def _spread(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]) -> float:
-    """Returns the farthest in m that any point of `geom` gets from the anchor of the first joint of `chain`."""
+def _max_anchor_distance(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]) -> float:
+    """Returns an upper bound in m of the distance of any point of `geom` from the anchor of the first joint."""
     anchors = data.xanchor[list(chain)]
-    between = float(np.linalg.norm(np.diff(anchors, axis=0), axis=1).sum())
-    points, radius = _hull(model, data, geom)
-    tip = max(float(np.linalg.norm(point - anchors[-1])) for point in points) + radius
-    return between + tip + _travel(model, data, chain[1:])
+    between_anchors = float(np.linalg.norm(np.diff(anchors, axis=0), axis=1).sum())
+    points, radius = _enclosing_balls(model, data, geom)
+    from_last_anchor = max(float(np.linalg.norm(point - anchors[-1])) for point in points) + radius
+    return between_anchors + from_last_anchor + _max_slide(model, chain[1:])
 
 
-def _travel(model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int]) -> float:
-    """Returns how far in m the slides among `joints` shift what hangs on them, against `qpos0`."""
+def _max_slide(model: mujoco.MjModel, joints: Sequence[int]) -> float:
+    """Returns the maximum sum in m of the displacements of the slides among `joints`, relative to `qpos0`."""
     reference = model.qpos0[model.jnt_qposadr[list(joints)]]
     shift = np.abs(model.jnt_range[list(joints)] - reference[:, None]).max(axis=1)
     return float(shift[model.jnt_type[list(joints)] == SLIDE].sum())
 
 
-def _from_axis(data: mujoco.MjData, joint: int, point: np.ndarray) -> float:
+def _axis_distance(data: mujoco.MjData, joint: int, point: np.ndarray) -> float:
+    """Returns the distance in m of `point` (f64[3] m in world) from the axis of `joint`."""
     return float(np.linalg.norm(np.cross(data.xaxis[joint], point - data.xanchor[joint])))
 
 
-def _hull(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[list[np.ndarray], float]:
-    """Returns points in world and the radius of balls around them whose hull holds `geom`."""
+def _enclosing_balls(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[list[np.ndarray], float]:
+    """Returns centres (f64[3] m in world) and the common radius in m of balls whose convex hull contains `geom`."""
     center = data.geom_xpos[geom]
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
         half_axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * model.geom_size[geom, 1]

@@ -1,7 +1,7 @@
-"""Signed distances of points, segments and convex solids.
+"""Distances of points and segments from segments, boxes, cylinders and ellipsoids.
 
-A vector is three arrays, one for each coordinate: XLA for CPU vectorises over pairs then, which it does not over
-arrays whose last axis has three entries. Every function works on arrays of any one shape.
+A vector is a tuple of three arrays (`xla.vectors.Vector`), so that XLA on CPU vectorises over the pairs. All functions
+are elementwise: the coordinate arrays have any one shape, written f32[...] here.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,44 +18,71 @@ from jax import Array
 from vsearch_jax.xla.vectors import Vector, dot
 
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
-# 0.618^14 = 1e-3 of the axis; near its minimum the distance changes by far less. The ends are looked at too.
+# Golden section leaves 0.618^14 = 1e-3 of the axis. The distance changes far less than that near its minimum.
 SEARCH_ITERATIONS = 14
-# Tangents from both ends of the bracket: for axes as long as an arm's some 0.1 mm is left, on the safe side.
+# Cutting planes leave an error of about 0.1 mm for the axes of a robot arm. The result is then too small, never too
+# large.
 TANGENT_ITERATIONS = 6
-# Newton's steps from the left of a convex sum converge quadratically, and what is left shortens the distance.
+# Newton's method on a convex function converges quadratically from the left. The remaining error makes the distance
+# smaller.
 NEWTON_ITERATIONS = 6
 
 
 def coordinates(vectors: Array) -> Vector:
-    """Returns the coordinates of `vectors` (f32[..., 3])."""
+    """Returns the x, y and z coordinates, f32[...] each, of `vectors`, f32[..., 3]."""
     return vectors[..., 0], vectors[..., 1], vectors[..., 2]
 
 
 def rotate(rotation: Array, vector: Vector) -> Vector:
-    """Returns `vector` turned by `rotation` (f32[..., 3, 3])."""
+    """Rotates vectors.
+
+    Args:
+      rotation: f32[..., 3, 3].
+      vector: Vector of f32[...].
+
+    Returns:
+      Vector of f32[...], `rotation` times `vector`.
+    """
     x, y, z = (dot(coordinates(rotation[..., row, :]), vector) for row in range(3))
     return x, y, z
 
 
 def subtract(a: Vector, b: Vector) -> Vector:
-    """Returns a - b."""
+    """Returns a - b.
+
+    Args:
+      a: Vector of f32[...].
+      b: Vector of f32[...].
+    """
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 def add_scaled(a: Vector, s: Array, b: Vector) -> Vector:
-    """Returns a + s b."""
+    """Returns a + s b.
+
+    Args:
+      a: Vector of f32[...].
+      s: f32[...], scale of `b`.
+      b: Vector of f32[...].
+    """
     return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
 
 
 def length(vector: Vector) -> Array:
-    """Returns the length; its gradient is finite at zero."""
+    """Returns the length f32[...] of a Vector of f32[...]; at zero it is 1e-12 and its gradient is finite."""
     return jnp.sqrt(jnp.maximum(dot(vector, vector), 1e-24))
 
 
 def segment_distance(center_a: Vector, half_a: Vector, center_b: Vector, half_b: Vector) -> Array:
-    """Returns the distance in m of two segments, each given by its middle and half of itself (m).
+    """Returns the distance f32[...] in m between two segments (Ericson, Real-Time Collision Detection, 5.1.9).
 
-    A segment may be a point; parallel segments are no exception (Ericson, Real-Time Collision Detection, 5.1.9).
+    A segment may be a point. Segments may be parallel.
+
+    Args:
+      center_a: m, midpoint of the first segment.
+      half_a: m, vector from the midpoint of the first segment to one of its ends.
+      center_b: m, midpoint of the second segment.
+      half_b: m, vector from the midpoint of the second segment to one of its ends.
     """
     tiny = 1e-12
     offset = subtract(center_a, center_b)
@@ -71,91 +99,115 @@ def segment_distance(center_a: Vector, half_a: Vector, center_b: Vector, half_b:
 
 
 def segment_box_distance(center: Vector, half_axis: Vector, size: Vector) -> Array:
-    """Returns the distance in m of a segment from a box, 0 where it passes through.
+    """Returns the distance f32[...] in m of a segment from a box; about 0 where the segment intersects the box.
 
-    The squared distance is convex along the segment and quadratic between the points where it crosses the planes of
-    the faces. So its slope is a straight line between the last of them where it falls and the first where it rises.
+    The squared distance is convex along the segment. It is quadratic between the points where the segment crosses the
+    planes of the faces. Its slope is therefore linear between the last such point with a negative slope and the first
+    one with a positive slope. The minimum lies at the zero of this line.
 
     Args:
-      center: m, the segment's middle in the box's frame.
-      half_axis: m, from the middle to one end.
+      center: m, midpoint of the segment in the box's frame.
+      half_axis: m, vector from the midpoint to one end, in the box's frame.
       size: m, half sizes of the box.
     """
 
-    def outside(s: Array) -> Vector:
-        x, y, z = (x - jnp.clip(x, -h, h) for x, h in zip(add_scaled(center, s, half_axis), size, strict=True))
+    def offset_from_box(s: Array) -> Vector:
+        """Returns the vector from the box's nearest point to the segment's point at `s`."""
+        point = add_scaled(center, s, half_axis)
+        x, y, z = (x - jnp.clip(x, -h, h) for x, h in zip(point, size, strict=True))
         return x, y, z
 
     low, high = jnp.full_like(center[0], -1.0), jnp.ones_like(center[0])
-    slope_first, slope_last = (dot(half_axis, outside(end)) for end in (low, high))
+    slope_first, slope_last = (dot(half_axis, offset_from_box(end)) for end in (low, high))
     slope_low, slope_high = jnp.minimum(slope_first, 0.0), jnp.maximum(slope_last, 0.0)
     for x, half, extent in zip(center, half_axis, size, strict=True):
         inverse = 1.0 / jnp.where(jnp.abs(half) < 1e-9, 1e-9, half)
         for face in (extent, -extent):
             s = jnp.clip((face - x) * inverse, -1.0, 1.0)
-            slope = dot(half_axis, outside(s))
-            falls, rises = slope <= 0.0, slope >= 0.0
-            low, slope_low = _larger(low, s, falls), _larger(slope_low, slope, falls)
-            high, slope_high = -_larger(-high, -s, rises), -_larger(-slope_high, -slope, rises)
+            slope = dot(half_axis, offset_from_box(s))
+            is_falling, is_rising = slope <= 0.0, slope >= 0.0
+            low, slope_low = _maximum_where(is_falling, low, s), _maximum_where(is_falling, slope_low, slope)
+            high = -_maximum_where(is_rising, -high, -s)
+            slope_high = -_maximum_where(is_rising, -slope_high, -slope)
     share = -slope_low / jnp.maximum(slope_high - slope_low, 1e-20)
     s = low + (high - low) * jnp.clip(share, 0.0, 1.0)
     s = jnp.where(slope_first >= 0.0, -1.0, jnp.where(slope_last <= 0.0, 1.0, s))
-    return length(outside(s))
+    return length(offset_from_box(s))
 
 
-def _larger(a: Array, b: Array, is_taken: Array) -> Array:
-    """Returns the larger of a and, where it is taken, b."""
-    return jnp.where(is_taken, jnp.maximum(a, b), a)
+def _maximum_where(condition: Array, a: Array, b: Array) -> Array:
+    """Returns the maximum of `a` and `b` where `condition` is true, elsewhere `a`."""
+    return jnp.where(condition, jnp.maximum(a, b), a)
+
+
+class _Tangent(NamedTuple):
+    """The tangent of a distance function at one point of a segment.
+
+    Attributes:
+      s: f32[...] in [-1, 1], the point; -1 and 1 are the ends of the segment.
+      distance: f32[...] m, distance at `s`.
+      slope: f32[...] m, derivative of the distance with respect to `s`.
+    """
+
+    s: Array
+    distance: Array
+    slope: Array
 
 
 def segment_cylinder_distance(center: Vector, half_axis: Vector, radius: Array, half_length: Array) -> Array:
-    """Returns the distance in m of a segment from a cylinder about z, or a little less; 0 where it passes through.
+    """Returns a lower bound f32[...] in m of the distance of a segment from a cylinder about z.
 
-    For segments of half a metre it is some 0.1 mm less at most. The distance is convex along the segment, so it lies
-    above its tangents. Where those of the two ends of a bracket meet is the next place to look (Kelley: cutting
-    planes, in one dimension).
+    For segments of 0.5 m the bound is at most about 0.1 mm below the distance. It is about 0 where the segment
+    intersects the cylinder. The method is Kelley's cutting planes in one dimension: the distance is convex along the
+    segment, so it lies above its tangents. The next point of a bracket is where the tangents of its two ends intersect.
 
     Args:
-      center: m, the segment's middle in the cylinder's frame.
-      half_axis: m, from the middle to one end.
-      radius: m.
-      half_length: m.
+      center: m, midpoint of the segment in the cylinder's frame.
+      half_axis: m, vector from the midpoint to one end, in the cylinder's frame.
+      radius: f32[...] m.
+      half_length: f32[...] m.
     """
 
-    def at(s: Array) -> tuple[Array, Array, Array]:
+    def tangent(s: Array) -> _Tangent:
         x, y, z = add_scaled(center, s, half_axis)
         radial = jnp.sqrt(jnp.maximum(x * x + y * y, 1e-24))
-        beside, above = jnp.maximum(radial - radius, 0.0), z - jnp.clip(z, -half_length, half_length)
-        distance = jnp.sqrt(jnp.maximum(beside * beside + above * above, 1e-24))
-        outward = (x * half_axis[0] + y * half_axis[1]) / radial
-        return s, distance, (beside * outward + above * half_axis[2]) / distance
+        radial_gap, axial_gap = jnp.maximum(radial - radius, 0.0), z - jnp.clip(z, -half_length, half_length)
+        distance = jnp.sqrt(jnp.maximum(radial_gap * radial_gap + axial_gap * axial_gap, 1e-24))
+        radial_slope = (x * half_axis[0] + y * half_axis[1]) / radial
+        return _Tangent(s, distance, (radial_gap * radial_slope + axial_gap * half_axis[2]) / distance)
 
-    def meeting(low: tuple[Array, Array, Array], high: tuple[Array, Array, Array]) -> Array:
-        (s_low, f_low, slope_low), (s_high, f_high, slope_high) = low, high
-        s = f_high - f_low + slope_low * s_low - slope_high * s_high
-        s = jnp.clip(s / jnp.minimum(slope_low - slope_high, -1e-9), s_low, s_high)
-        return jnp.where(slope_low >= 0.0, s_low, jnp.where(slope_high <= 0.0, s_high, s))
-
-    low, high = at(jnp.full_like(center[0], -1.0)), at(jnp.ones_like(center[0]))
+    low, high = tangent(jnp.full_like(center[0], -1.0)), tangent(jnp.ones_like(center[0]))
     for _ in range(TANGENT_ITERATIONS):
-        new = at(meeting(low, high))
-        falls = new[2] <= 0.0
+        new = tangent(_tangent_intersection(low, high))
+        is_falling = new.slope <= 0.0
         low, high = (
             jax.tree.map(functools.partial(jnp.where, is_replaced), new, end)
-            for is_replaced, end in ((falls, low), (~falls, high))
+            for is_replaced, end in ((is_falling, low), (~is_falling, high))
         )
-    s = meeting(low, high)
-    bounds = [distance + slope * (s - place) for place, distance, slope in (low, high)]
+    s = _tangent_intersection(low, high)
+    bounds = [end.distance + end.slope * (s - end.s) for end in (low, high)]
     return jnp.maximum(jnp.maximum(*bounds), 0.0)
 
 
-def ellipsoid_distance(point: Vector, size: Vector) -> Array:
-    """Returns the signed distance in m of `point` from an ellipsoid of radii `size`.
+def _tangent_intersection(low: _Tangent, high: _Tangent) -> Array:
+    """Returns f32[...], where two tangents of a convex function intersect; an end if the minimum lies there."""
+    s = high.distance - low.distance + low.slope * low.s - high.slope * high.s
+    s = jnp.clip(s / jnp.minimum(low.slope - high.slope, -1e-9), low.s, high.s)
+    return jnp.where(low.slope >= 0.0, low.s, jnp.where(high.slope <= 0.0, high.s, s))
 
-    The foot of the perpendicular is r^2 p / (t + r^2) with t the largest root of sum (r p / (t + r^2))^2 = 1 (Eberly,
-    Distance from a Point to an Ellipsoid). The sum is convex and falls, so Newton's steps from the left stay left.
+
+def ellipsoid_distance(point: Vector, size: Vector) -> Array:
+    """Returns the signed distance f32[...] in m of a point from an ellipsoid; negative inside.
+
+    The nearest point of the surface is r^2 p / (t + r^2), for each coordinate p and radius r. Here t is the largest
+    root of sum (r p / (t + r^2))^2 = 1 (Eberly, Distance from a Point to an Ellipsoid). The sum is convex and falls
+    with t. Newton's method therefore converges from the left, and never passes the root.
+
+    Args:
+      point: m, in the ellipsoid's frame.
+      size: m, radii of the ellipsoid.
     """
-    # The floor keeps the foot unique at the centre and in the planes of symmetry.
+    # The floor makes the nearest point unique at the centre and in the planes of symmetry.
     p = tuple(jnp.maximum(jnp.abs(x), 1e-7) for x in point)
     squared = tuple(r * r for r in size)
     t = functools.reduce(jnp.maximum, [r * x - r * r for r, x in zip(size, p, strict=True)])
@@ -167,10 +219,16 @@ def ellipsoid_distance(point: Vector, size: Vector) -> Array:
     return jnp.sign(t) * length((x, y, z))
 
 
-def least_along(distance: Callable[[Vector], Array], center: Vector, half_axis: Vector) -> Array:
-    """Returns the least of a convex `distance` over the segments, by golden section."""
+def min_along_segment(distance: Callable[[Vector], Array], center: Vector, half_axis: Vector) -> Array:
+    """Returns the minimum f32[...] in m of a convex function along a segment, by golden-section search.
 
-    def at(s: Array) -> Array:
+    Args:
+      distance: maps points (Vector of f32[...]) to f32[...] m. Must be convex along each segment.
+      center: m, midpoint of the segment.
+      half_axis: m, vector from the midpoint to one end.
+    """
+
+    def distance_at(s: Array) -> Array:
         return distance(add_scaled(center, s, half_axis))
 
     if center[0].size == 0:
@@ -178,17 +236,23 @@ def least_along(distance: Callable[[Vector], Array], center: Vector, half_axis: 
     low = jnp.full(center[0].shape, -1.0)
     high = -low
     first = jnp.stack([high - GOLDEN * (high - low), low + GOLDEN * (high - low), low, high])
-    f_low, f_high, *f_ends = jax.vmap(at)(first)  # four calls would be compiled one by one
-    state = (low, high, f_low, f_high, jnp.minimum(*f_ends))
-    *_, f_low, f_high, f_ends = jax.lax.fori_loop(0, SEARCH_ITERATIONS, functools.partial(_narrow, at), state)
+    f_low, f_high, *f_ends = jax.vmap(distance_at)(first)  # XLA would compile four separate calls one by one.
+    bracket = (low, high, f_low, f_high, jnp.minimum(*f_ends))
+    narrow = functools.partial(_narrow_bracket, distance_at)
+    *_, f_low, f_high, f_ends = jax.lax.fori_loop(0, SEARCH_ITERATIONS, narrow, bracket)
     return jnp.minimum(jnp.minimum(f_low, f_high), f_ends)
 
 
-def _narrow(at: Callable[[Array], Array], _: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-    low, high, f_low, f_high, f_ends = state  # f at low + (1 - GOLDEN) width and at low + GOLDEN width
+_Bracket: TypeAlias = tuple[Array, Array, Array, Array, Array]
+"""Ends of the bracket; values at low + (1 - GOLDEN) width and low + GOLDEN width; minimum at the segment's ends."""
+
+
+def _narrow_bracket(distance_at: Callable[[Array], Array], _: Array, bracket: _Bracket) -> _Bracket:
+    """Makes one step of golden-section search."""
+    low, high, f_low, f_high, f_ends = bracket
     is_left = f_low < f_high
     width = high - low
     low, high = jnp.where(is_left, low, high - GOLDEN * width), jnp.where(is_left, low + GOLDEN * width, high)
     width = high - low
-    f_new = at(jnp.where(is_left, high - GOLDEN * width, low + GOLDEN * width))
+    f_new = distance_at(jnp.where(is_left, high - GOLDEN * width, low + GOLDEN * width))
     return low, high, jnp.where(is_left, f_new, f_high), jnp.where(is_left, f_low, f_new), f_ends

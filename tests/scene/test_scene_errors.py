@@ -1,0 +1,82 @@
+"""Faulty files and unknown names raise SceneError with one line that names the file and the remedy."""
+
+import re
+
+import pytest
+
+from samples.second_arm import MJCF
+from vsearch_jax.config import SceneConfig
+from vsearch_jax.scene import SceneError, build_scene, xml_folder
+
+
+@pytest.mark.parametrize(
+    ("part", "content", "words"),
+    [
+        ("object", None, ["object", "does not exist", "teapot"]),
+        ("arm", None, ["arm", "does not exist", "lwr"]),
+        ("object", "<mujoco><worldbody/></mujoco>", ["has no geom"]),
+        ("object", "<mujoco><world/></mujoco>", ["cannot be loaded", "unrecognized element"]),
+        ("arm", MJCF.replace('name="tcp"', ""), ["no site named 'tcp'"]),
+        ("arm", MJCF.replace('<camera name="wrist"', '<camera name="eye"'), ["no camera named 'wrist'"]),
+        (
+            "arm",
+            '<mujoco><worldbody><body><geom size="1"/><site name="tcp"/><camera name="wrist"/></body></worldbody>'
+            "</mujoco>",
+            ["no joint that moves the camera"],
+        ),
+        (
+            "arm",
+            '<mujoco><worldbody><body><freejoint name="fly"/><geom size="1"/><site name="tcp"/><camera name="wrist"/>'
+            "</body></worldbody></mujoco>",
+            ["'fly'", "is a free joint or a ball joint"],
+        ),
+    ],
+)
+def test_a_faulty_file_raises_an_error_of_one_line(tmp_path, part, content, words):
+    path = tmp_path / "file.xml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(SceneError) as caught:
+        build_scene(SceneConfig(**{part: str(path)}))
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in [str(path), *words]:
+        assert word in message
+
+
+def test_a_plane_that_the_arm_could_touch_is_rejected(tmp_path):
+    path = tmp_path / "wall.xml"
+    wall = '<mujoco><worldbody><geom name="wall" type="plane" size="1 1 .1" pos="1 0 0" {bits}/></worldbody></mujoco>'
+    path.write_text(wall.format(bits=""))
+    with pytest.raises(SceneError, match=r"geom 'obstacle/wall' .* is a plane.*make it a box"):
+        build_scene(SceneConfig(obstacles=str(path)))
+    path.write_text(wall.format(bits='contype="0" conaffinity="0"'))
+    assert len(build_scene(SceneConfig(obstacles=str(path))).obstacle_geom_ids) == 1
+
+
+def test_a_wrist_camera_without_a_centred_square_sensor_is_rejected(tmp_path):
+    path = tmp_path / "arm.xml"
+    text = (xml_folder() / "arm" / "lwr.xml").read_text()
+    for attributes, is_valid in (
+        ('projection="orthographic"', False),
+        ('focal=".01 .01" sensorsize=".008 .006" resolution="64 48"', False),
+        ('focal=".01 .01" sensorsize=".006 .006" principal=".001 0" resolution="64 64"', False),
+        ('focal=".01 .01" sensorsize=".006 .006" resolution="64 64"', True),
+    ):
+        path.write_text(re.sub(r'(<camera name="wrist"[^>]*?) fovy="[^"]*"', rf"\1 {attributes}", text))
+        if is_valid:
+            assert build_scene(SceneConfig(arm=str(path))).mj_model.ncam
+        else:
+            with pytest.raises(SceneError, match="camera 'wrist' is orthographic or its sensor"):
+                build_scene(SceneConfig(arm=str(path)))
+
+
+def test_a_faulty_mesh_and_an_unknown_name_raise_an_error(tmp_path):
+    path = tmp_path / "part.stl"
+    path.write_text("no mesh")
+    with pytest.raises(SceneError, match=r"part\.stl.*cannot be loaded"):
+        build_scene(SceneConfig(object=str(path)))
+    with pytest.raises(SceneError, match="unknown object 'teepot'; available: bracket, teapot, truck"):
+        build_scene(SceneConfig(object="teepot"))
+    with pytest.raises(SceneError, match="unknown arm 'kuka'; available: lwr, ur5e"):
+        build_scene(SceneConfig(arm="kuka"))

@@ -1,0 +1,103 @@
+"""Which geoms can touch each other, by MuJoCo's rules."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from vsearch_jax.robot.collision.motion_bounds import extent_from_still_point
+
+NEVER_NEAR = 0.05
+"""m. Planning ignores pairs whose distance is never smaller than this, because they never limit a motion."""
+
+
+class Geoms(NamedTuple):
+    """MuJoCo's numbers of the geoms.
+
+    Attributes:
+      arm: geoms of the arm, its fixed base included.
+      mount: geoms of the mount.
+      object: geoms of the object.
+      obstacles: geoms of the obstacles.
+    """
+
+    arm: tuple[int, ...]
+    mount: tuple[int, ...]
+    object: tuple[int, ...]
+    obstacles: tuple[int, ...]
+
+
+def touching_pairs(
+    model: mujoco.MjModel, data: mujoco.MjData, geoms: Geoms, is_for_planning: bool
+) -> list[tuple[int, int]]:
+    """Lists the pairs of geoms that can touch, the table not included.
+
+    Args:
+      model: the compiled scene.
+      data: its kinematics at `qpos0`.
+      geoms: numbers of the geoms.
+      is_for_planning: whether to leave out pairs that never come nearer than `NEVER_NEAR`.
+
+    Returns:
+      Pairs of a moving geom of the arm and another geom. Each pair is listed once.
+    """
+    moving = _moving_geoms(model, geoms)
+    fixed = [*(g for g in geoms.arm if g not in moving), *geoms.mount, *geoms.object, *geoms.obstacles]
+    pairs = [(a, b) for i, a in enumerate(moving) for b in [*moving[i + 1 :], *fixed]]
+    pairs = [(a, b) for a, b in pairs if _can_touch(model, a, b)]
+    return [pair for pair in pairs if not is_for_planning or _can_come_near(model, data, pair)]
+
+
+def table_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: Geoms, is_for_planning: bool) -> list[int]:
+    """Lists the moving geoms of the arm that can touch the table.
+
+    Args:
+      model: the compiled scene.
+      data: its kinematics at `qpos0`.
+      geoms: numbers of the geoms.
+      is_for_planning: whether to leave out geoms that never come nearer to the table than `NEVER_NEAR`.
+
+    Returns:
+      MuJoCo's numbers of the geoms.
+    """
+    moving = [g for g in _moving_geoms(model, geoms) if model.geom_contype[g] | model.geom_conaffinity[g]]
+    return [g for g in moving if not is_for_planning or _min_height(model, data, g) < NEVER_NEAR]
+
+
+def _moving_geoms(model: mujoco.MjModel, geoms: Geoms) -> list[int]:
+    """Returns the geoms of the arm that at least one joint moves."""
+    return [g for g in geoms.arm if model.body_weldid[model.geom_bodyid[g]] != 0]
+
+
+def _can_come_near(model: mujoco.MjModel, data: mujoco.MjData, pair: tuple[int, int]) -> bool:
+    """Returns False if the distance of the pair is never smaller than `NEVER_NEAR`."""
+    moving, other = pair
+    if model.body_weldid[model.geom_bodyid[other]] != 0:
+        return True
+    point, extent = extent_from_still_point(model, data, moving)
+    distance = float(np.linalg.norm(data.geom_xpos[other] - point)) - float(model.geom_rbound[other])
+    return distance - extent < NEVER_NEAR
+
+
+def _min_height(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Returns a lower bound in m of the height of `geom` above the table."""
+    point, extent = extent_from_still_point(model, data, geom)
+    return float(point[2]) - float(model.geom("table").pos[2]) - extent
+
+
+def _can_touch(model: mujoco.MjModel, a: int, b: int) -> bool:
+    """Applies MuJoCo's collision filter: contact bits, weld groups, parent and child, excluded bodies."""
+    if not (model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]):
+        return False
+    body_a, body_b = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
+    weld_a, weld_b = int(model.body_weldid[body_a]), int(model.body_weldid[body_b])
+    if weld_a == weld_b:
+        return False
+    parent_a = int(model.body_weldid[model.body_parentid[weld_a]])
+    parent_b = int(model.body_weldid[model.body_parentid[weld_b]])
+    if weld_a and weld_b and (parent_a == weld_b or parent_b == weld_a):
+        return False
+    signature = (min(body_a, body_b) << 16) + max(body_a, body_b)
+    return signature not in model.exclude_signature
