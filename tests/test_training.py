@@ -1,4 +1,4 @@
-"""The run as one function: one trace, equal chunks, seeds that matter, nothing that is not a number."""
+"""Training as one function: one trace for each config, equality of chunks, dependence on the seed, finite values."""
 
 from __future__ import annotations
 
@@ -17,13 +17,17 @@ CONFIG = vs.Config.preset("smoke")
 
 
 def arrays(state):
-    """Returns the leaves by path, keys as their data."""
+    """Returns the leaves of a state by path. A PRNG key is returned as its data."""
+
+    def as_numpy(x):
+        return np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+
     leaves = jax.tree_util.tree_flatten_with_path(state)[0]
-    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
-    return {jax.tree_util.keystr(p): np.asarray(jax.random.key_data(x) if is_key(x) else x) for p, x in leaves}
+    return {jax.tree_util.keystr(path): as_numpy(leaf) for path, leaf in leaves}
 
 
 def run(config, seed=0):
+    """Returns state and metrics after all chunks of a run."""
     state, rows = vs.init(jax.random.key(seed), config), []
     for _ in range(config.num_chunks):
         state, metrics = vs.train(state, config)
@@ -33,16 +37,17 @@ def run(config, seed=0):
 
 @pytest.fixture(scope="module")
 def chunked():
+    """State and metrics of a run in chunks, and the number of traces."""
     training._train.clear_cache()
     state, metrics = run(CONFIG)
     return state, metrics, training._train._cache_size()
 
 
-def test_every_chunk_of_a_config_is_one_trace(chunked):
+def test_all_chunks_of_a_config_share_one_trace(chunked):
     assert chunked[2] == 1
 
 
-def test_an_uncut_run_equals_its_chunks_bit_for_bit(chunked):
+def test_run_in_one_piece_equals_a_run_in_chunks_bit_for_bit(chunked):
     state, metrics = run(dataclasses.replace(CONFIG, num_chunks=1))
     for path, expected in arrays(chunked[0]).items():
         np.testing.assert_array_equal(arrays(state)[path], expected, err_msg=path)
@@ -51,52 +56,55 @@ def test_an_uncut_run_equals_its_chunks_bit_for_bit(chunked):
         np.testing.assert_array_equal(metrics[name][:count], expected[:count], err_msg=name)
 
 
-def test_metrics_belong_to_their_stage(chunked):
+def test_metrics_are_finite_in_their_stage_and_nan_in_the_other(chunked):
     metrics = chunked[1]
     stage, updates = metrics["stage"], CONFIG.encoder.num_updates
     assert stage.tolist()[: CONFIG.num_iterations] == [0] * updates + [1] * CONFIG.num_policy_iterations
     assert np.isfinite(metrics["encoder_loss"][:updates]).all()
     assert np.isnan(metrics["encoder_loss"][updates:]).all()
     assert np.isfinite(metrics["reward"][stage == 1]).all()
+    assert np.isnan(metrics["reward"][stage == 0]).all()
     is_learning = np.arange(CONFIG.num_policy_iterations) * CONFIG.sac.num_envs >= CONFIG.sac.num_warmup_steps
     np.testing.assert_array_equal(np.isfinite(metrics["critic_loss"][stage == 1]), is_learning)
 
 
-def test_the_encoder_learns_and_then_stays(chunked):
+def test_encoder_learns_and_does_not_change_in_the_policy_stage(chunked):
     losses = chunked[1]["encoder_loss"][: CONFIG.encoder.num_updates]
     assert losses[-1] < losses[0]
     start = vs.init(jax.random.key(0), CONFIG)
-    half = dataclasses.replace(CONFIG, num_chunks=4)
-    state, _ = vs.train(start, half)
+    config, num_policy_chunks = dataclasses.replace(CONFIG, num_chunks=4), 0
+    state, _ = vs.train(start, config)
     for _ in range(3):
         before = arrays(state.encoder)
-        state, metrics = vs.train(state, half)
+        state, metrics = vs.train(state, config)
         if (np.asarray(metrics["stage"]) == 1).all():
+            num_policy_chunks += 1
             after = arrays(state.encoder)
             assert all((before[path] == after[path]).all() for path in before)
+    assert num_policy_chunks > 0
 
 
-def test_whole_state_is_finite(chunked):
+def test_state_is_finite_after_the_run(chunked):
     for path, leaf in arrays(chunked[0]).items():
         assert np.isfinite(leaf).all(), path
 
 
-def test_replay_holds_every_environment_step(chunked):
+def test_replay_counts_every_environment_step(chunked):
     replay = chunked[0].replay
     assert np.asarray(replay.num_inserted).tolist() == [CONFIG.sac.num_environment_steps] * CONFIG.sac.num_seeds
     assert int(chunked[0].step) == CONFIG.num_iterations
 
 
-def test_after_the_end_nothing_changes(chunked):
+def test_train_after_the_last_chunk_changes_nothing(chunked):
     before = arrays(chunked[0])
-    copy = jax.tree.map(lambda x: x.copy(), chunked[0])  # train donates what it is given
+    copy = jax.tree.map(lambda x: x.copy(), chunked[0])  # `train` donates its argument.
     state, metrics = vs.train(copy, CONFIG)
     assert (np.asarray(metrics["stage"]) == -1).all()
     for path, leaf in arrays(state).items():
         np.testing.assert_array_equal(leaf, before[path], err_msg=path)
 
 
-def test_a_restored_run_ends_bit_for_bit_as_an_uninterrupted_one(chunked, tmp_path):
+def test_restored_run_equals_an_uninterrupted_run_bit_for_bit(chunked, tmp_path):
     state = vs.init(jax.random.key(0), CONFIG)
     for _ in range(2):
         state, _ = vs.train(state, CONFIG)
@@ -109,7 +117,7 @@ def test_a_restored_run_ends_bit_for_bit_as_an_uninterrupted_one(chunked, tmp_pa
         np.testing.assert_array_equal(arrays(restored)[path], expected, err_msg=path)
 
 
-def test_the_seed_matters(chunked):
+def test_initial_parameters_depend_on_the_seed():
     other = vs.init(jax.random.key(1), CONFIG)
     first = vs.init(jax.random.key(0), CONFIG)
     a, b = arrays(first.encoder.params), arrays(other.encoder.params)

@@ -1,7 +1,8 @@
-"""Pytrees that cross a module's border.
+"""Pytrees that several rooms share.
 
-Every class here is written for one item. Batch axes come from `jax.vmap` and lead.
-Frames: `world` is MuJoCo's world frame (z up); a camera looks along its own -z with +y up.
+Every class is written for one item. Batch axes come from `jax.vmap` and lead.
+Frames: `world` is MuJoCo's world frame, z up. A camera looks along its own -z axis, with +y up.
+An `Observation` is what the wrist camera sees from one pose of the arm. An `obs` is the policy's flat input vector.
 """
 
 from __future__ import annotations
@@ -12,20 +13,19 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import flax.struct
 from jax import Array
 
-if TYPE_CHECKING:  # imports that take seconds, needed for annotations only
+if TYPE_CHECKING:  # These imports take seconds, and only annotations need them.
     import optax
     from brax.envs.base import State
     from flax import nnx
 
-ParamTree: TypeAlias = "dict[str, ParamTree | Array]"
-"""Network parameters as nested dictionaries of arrays."""
+ParamTree: TypeAlias = "dict[str, ParamTree | Array]"  # network parameters
 
 
 class View(NamedTuple):
-    """A camera pose on the view sphere: the camera looks at the sphere's centre, image upright.
+    """A camera pose on the view sphere. The camera looks at the sphere's centre, and the image is upright.
 
     Attributes:
-      azimuth: f32[] rad, about world z, 0 along world +x.
+      azimuth: f32[] rad, about world z; 0 along world +x.
       elevation: f32[] rad above the table plane.
     """
 
@@ -38,11 +38,10 @@ class Camera:
     """A pinhole camera.
 
     Attributes:
-      position: f32[3] m, of the optical centre in world.
-      rotation: f32[3, 3], camera to world; columns are the camera's x, y, z axes; it looks along -z.
+      position: f32[3] m, optical centre in world.
+      rotation: f32[3, 3], camera to world. Columns are the camera's x, y, z axes. The camera looks along -z.
       fovy: f32[] rad, vertical field of view; not used with intrinsics.
-      intrinsics: f32[4] pixels, or None: focal lengths fx and fy and principal point cx and cy, as a calibration gives
-        them, with the centre of the first pixel at (0, 0) and y down. They hold for one image size.
+      intrinsics: f32[4] pixels, or None: fx, fy, cx, cy for one image size; first pixel's centre is (0, 0), y down.
     """
 
     position: Array
@@ -53,14 +52,13 @@ class Camera:
 
 @flax.struct.dataclass
 class Image:
-    """What a camera sees; row 0 is the top of the image.
+    """A rendered image; row 0 is the top.
 
     Attributes:
       rgb: f32[H, W, 3] in [0, 1].
-      depth: f32[H, W] m along the optical axis, +inf on a miss.
-      geom_id: i32[H, W], MuJoCo's geom number, -1 on a miss.
-      normal: f32[H, W, 3], unit, in world, of the surface as it is lit, towards the camera; 0 on a miss. Pictures
-        that are not drawn have none.
+      depth: f32[H, W] m along the optical axis; +inf on a miss.
+      geom_id: i32[H, W], MuJoCo's geom number; -1 on a miss.
+      normal: f32[H, W, 3], unit normal in world, towards the camera; 0 on a miss. None if the image is not rendered.
     """
 
     rgb: Array
@@ -70,21 +68,21 @@ class Image:
 
 
 class IKStatus(enum.IntEnum):
-    """How an inverse-kinematics problem ended: solved, no start led there, or pose or joints were NaN or infinite."""
+    """Result of an inverse-kinematics problem."""
 
     SOLVED = 0
-    UNREACHABLE = 1
-    NOT_FINITE = 2
+    UNREACHABLE = 1  # no start converged
+    NOT_FINITE = 2  # the pose or the joint values were NaN or infinite
 
 
 @flax.struct.dataclass
 class IKResult:
-    """The outcome of one inverse-kinematics problem.
+    """The solution of one inverse-kinematics problem.
 
     Attributes:
-      qpos: f32[nq] rad or m; inside the joint limits.
+      qpos: f32[nq] rad or m, inside the joint limits.
       position_error: f32[] m.
-      rotation_error: f32[] rad, geodesic; with a free roll, of the optical axis.
+      rotation_error: f32[] rad, geodesic; with a free roll, the angle between the optical axes.
       is_converged: bool[], both errors are within the tolerances of the config.
       status: i32[], an IKStatus.
     """
@@ -97,7 +95,7 @@ class IKResult:
 
 
 class PlanStatus(enum.IntEnum):
-    """How a planning problem ended; see `vsearch_jax.planning.rrt_connect`."""
+    """Result of a planning problem; see `vsearch_jax.planning.rrt_connect`."""
 
     FOUND = 0
     EXHAUSTED = 1
@@ -107,10 +105,10 @@ class PlanStatus(enum.IntEnum):
 
 @flax.struct.dataclass
 class Path:
-    """A joint path of straight pieces.
+    """A piecewise straight path in joint space.
 
     Attributes:
-      waypoints: f32[W, nq] rad or m, from start to goal; the goal repeats to the end. All are the start without a path.
+      waypoints: f32[W, nq] rad or m, from start to goal, which fills the last rows. Without a path: only the start.
       length: f32[] rad (or m), sum of the Euclidean lengths in joint space; +inf without a path.
       status: i32[], a PlanStatus.
     """
@@ -122,14 +120,14 @@ class Path:
 
 @flax.struct.dataclass
 class ReachabilityMap:
-    """Which views of a grid the arm can reach, and with which joints.
+    """The views of a grid that the arm can reach, with joint values for each.
 
     Attributes:
-      azimuths: f32[A] rad, periodic and evenly spaced from 0.
-      elevations: f32[E] rad, evenly spaced and rising.
-      is_reachable: bool[A, E]: IK converges inside the limits without contact.
-      qpos: f32[A, E, nq], the best joints found for the view of each cell.
-      band: f32[2] rad, lowest and highest elevation of the widest run that is reachable at every azimuth.
+      azimuths: f32[A] rad, periodic, evenly spaced from 0.
+      elevations: f32[E] rad, evenly spaced, rising.
+      is_reachable: bool[A, E], IK converges inside the joint limits and without contact.
+      qpos: f32[A, E, nq] rad or m, the best joint values found for the view of each cell.
+      band: f32[2] rad, limits of the widest range of elevations reachable at every azimuth; NaN if there is none.
     """
 
     azimuths: Array
@@ -141,13 +139,13 @@ class ReachabilityMap:
 
 @flax.struct.dataclass
 class Observation:
-    """What the wrist camera sees from where the arm stands.
+    """What the wrist camera sees from one pose of the arm.
 
     Attributes:
-      view: View that was commanded.
-      qpos: f32[nq], joints that hold the camera there.
-      camera: Camera, where these joints truly put it: within IK's tolerance of the view.
-      code: f32[Z], encoding of the picture.
+      view: the commanded View.
+      qpos: f32[nq] rad or m, joint values of the arm.
+      camera: the Camera that `qpos` gives; it is within IK's tolerance of `view`.
+      code: f32[Z], code of the camera's image.
     """
 
     view: View
@@ -158,12 +156,12 @@ class Observation:
 
 @flax.struct.dataclass
 class EpisodeState:
-    """The view-search environment between two steps.
+    """State of a view-search episode between two steps.
 
     Attributes:
-      observation: Observation of the present view.
-      target: Observation of the view that is looked for.
-      num_steps: i32[], steps done in the episode.
+      observation: Observation from the present view.
+      target: Observation from the target view.
+      num_steps: i32[], number of steps done in the episode.
     """
 
     observation: Observation
@@ -172,15 +170,15 @@ class EpisodeState:
 
 
 class Transition(NamedTuple):
-    """One step of a view-search episode, as the replay keeps it.
+    """One step of a view-search episode. D is the size of `obs`, 265 for the LWR.
 
     Attributes:
-      obs: f32[265].
+      obs: f32[D], policy input before the step.
       action: f32[2] in [-1, 1].
       reward: f32[].
-      next_obs: f32[265], of the state before any reset.
-      terminated: f32[], 1 where the episode ended at the threshold: no value follows.
-      is_reachable: f32[], 1 where the arm could do the step; 0 where it stayed and `unreachable_reward` was paid.
+      next_obs: f32[D], policy input after the step and before any reset.
+      terminated: f32[], 1 if the step met the threshold. No reward follows such a step.
+      is_reachable: f32[], 1 if the arm did the step; 0 if it stayed, and the reward is `unreachable_reward`.
     """
 
     obs: Array
@@ -193,11 +191,11 @@ class Transition(NamedTuple):
 
 @flax.struct.dataclass
 class ReplayState:
-    """The newest transitions.
+    """The replay buffer: a ring of the newest transitions.
 
     Attributes:
       data: Transition with a leading axis of the buffer's capacity.
-      num_inserted: i32[], transitions inserted so far; the oldest are overwritten.
+      num_inserted: i32[], number of transitions inserted so far. New transitions overwrite the oldest.
     """
 
     data: Transition
@@ -225,13 +223,13 @@ class SACState:
 
 @flax.struct.dataclass
 class EncoderState:
-    """The augmented autoencoder and what turns its raw latent into a code.
+    """The augmented autoencoder, and the mean and whitening that turn its raw latent into a code.
 
     Attributes:
-      params: parameters of encoder and decoder (nnx state split to a pytree).
+      params: parameters of encoder and decoder.
       opt_state: optax state of `params`.
       latent_mean: f32[Z], mean raw latent over the reachable views.
-      whitening: f32[Z, Z], symmetric partial whitening matrix of the mean-free raw latent.
+      whitening: f32[Z, Z], symmetric partial whitening matrix of the centred raw latent.
     """
 
     params: ParamTree
@@ -242,18 +240,17 @@ class EncoderState:
 
 @flax.struct.dataclass
 class TrainState:
-    """Everything a run needs to go on; S is the number of policy seeds.
+    """Complete state of a run; S is the number of policy seeds.
 
     Attributes:
       encoder: EncoderState.
       reach: ReachabilityMap of the arm, mount and object.
-      pool: Observation of f32[N, ...]: random reachable views, seen once, from which training episodes start;
-        zeros until the encoder is done.
+      pool: Observation, leading axis N: random views where training episodes start; zeros until the encoder is done.
       sac: SACState, leading axis S.
       env: brax State of the training environments, leading axes S, num_envs.
-      replay: replay buffer state, leading axis S.
-      key: PRNG key from which every later random number of the run is folded.
-      step: i32[], iterations done, encoder updates first and policy iterations after them.
+      replay: ReplayState, leading axis S.
+      key: PRNG key. Every later random number of the run comes from it by `fold_in`.
+      step: i32[], number of iterations done: encoder updates first, then policy iterations.
     """
 
     encoder: EncoderState
@@ -267,13 +264,13 @@ class TrainState:
 
 
 class PolicyEnd(NamedTuple):
-    """What `SearchResult.end` holds of this searcher.
+    """End of a search by a policy; the value of `SearchResult.end`.
 
     Attributes:
       state: brax State at the end of the episode.
-      num_helped: i32[], steps that were not the policy's.
-      travel: f32[] rad, sum of the steps' metric `joint_travel`.
-      duration: f32[] s, sum of `motion_time`.
+      num_helped: i32[], number of steps that the local search chose, not the policy.
+      travel: f32[] rad, sum of the metric `joint_travel` over the steps.
+      duration: f32[] s, sum of the metric `motion_time` over the steps.
     """
 
     state: State
@@ -284,15 +281,15 @@ class PolicyEnd(NamedTuple):
 
 @flax.struct.dataclass
 class SearchResult:
-    """What one search found; G is the most generations (epochs, steps) that the config allows.
+    """Result of one search; G is the largest number of generations (or steps) that the config allows.
 
     Attributes:
-      view: View, the best view seen.
-      score: f32[], its score.
-      best_scores: f32[G], best score so far after each generation; the last value repeats after the end.
-      evaluations: i32[], images taken until the threshold was met, all of them if it was not.
-      unreachable: i32[], how many of these the arm could not reach.
-      end: PolicyEnd where the searcher is a policy, else None.
+      view: the best View.
+      score: f32[], score of `view`.
+      best_scores: f32[G], best score after each generation. After the end of the search the last value repeats.
+      evaluations: i32[], number of images until the threshold was met; the number of all images if it was not met.
+      unreachable: i32[], number of these views that the arm could not reach.
+      end: PolicyEnd if the searcher is a policy, otherwise None.
     """
 
     view: View

@@ -1,4 +1,4 @@
-"""Autoencoder: layers against XLA's convolution, loss against a sort, whitening, augmentation, learning."""
+"""Autoencoder: layers against XLA's convolution, loss against a sort, whitening, augmentation, training."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ LIT_MODEL = """
 BOOTSTRAPPED = jax.jit(jax.value_and_grad(fit.bootstrapped_mean), static_argnums=1)
 
 
-def small_config(**encoder):
+def smoke_config(**encoder):
+    """Returns the smoke preset with changed fields of EncoderConfig."""
     smoke = PRESETS["smoke"]
     return dataclasses.replace(smoke, encoder=dataclasses.replace(smoke.encoder, **encoder))
 
@@ -43,7 +44,7 @@ def small_config(**encoder):
 
 
 @pytest.mark.parametrize(("kernel_size", "stride"), [(3, 2), (5, 2), (8, 4)])
-def test_both_forms_of_the_convolution_agree_with_their_gradients(kernel_size, stride):
+def test_both_convolutions_and_their_gradients_agree(kernel_size, stride):
     x_key, kernel_key, weight_key = jax.random.split(jax.random.key(kernel_size), 3)
     x = jax.random.normal(x_key, (2, 16, 24, 3))
     kernel = jax.random.normal(kernel_key, (kernel_size, kernel_size, 3, 5))
@@ -54,31 +55,33 @@ def test_both_forms_of_the_convolution_agree_with_their_gradients(kernel_size, s
 
     for argument in (0, 1):
         ours, xla = (
-            jax.jit(jax.grad(functools.partial(total, form), argnums=argument))(x, kernel)
-            for form in (network.convolution_by_matmul, network.convolution_by_xla)
+            jax.jit(jax.grad(functools.partial(total, convolution), argnums=argument))(x, kernel)
+            for convolution in (network.convolution_by_matmul, network.convolution_by_xla)
         )
         np.testing.assert_allclose(ours, xla, rtol=1e-4, atol=1e-3)
-    ours, xla = (form(x[0], kernel, stride) for form in (network.convolution_by_matmul, network.convolution_by_xla))
+    ours, xla = (
+        convolution(x[0], kernel, stride) for convolution in (network.convolution_by_matmul, network.convolution_by_xla)
+    )
     assert ours.shape == (16 // stride, 24 // stride, 5)
     np.testing.assert_allclose(ours, xla, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("kind", INPUTS)
-def test_every_preset_and_input_gives_a_code_and_a_picture(preset, kind):
+def test_code_and_reconstruction_have_the_configured_shape_for_every_preset_and_input(preset, kind):
     config = Config.preset(preset)
     config = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, input=kind))
     features, size = 3 if kind == "rgb" else 1, config.scene.image_size
     state = jax.eval_shape(lambda: encoders.init(jax.random.key(0), config))
     x = jax.ShapeDtypeStruct((size, size, features), jnp.float32)
     code = jax.eval_shape(functools.partial(encoders.encode, config=config), state, x)
-    picture = jax.eval_shape(functools.partial(encoders.reconstruct, config=config), state.params, code)
+    reconstruction = jax.eval_shape(functools.partial(encoders.reconstruct, config=config), state.params, code)
     assert code.shape == (128,)
-    assert picture.shape == (config.encoder.decoder_size, config.encoder.decoder_size, features)
+    assert reconstruction.shape == (config.encoder.decoder_size, config.encoder.decoder_size, features)
 
 
-def test_parameters_are_nested_dictionaries_of_arrays_drawn_from_the_key():
-    config = small_config()
+def test_parameters_are_nested_dictionaries_of_arrays_and_depend_on_the_key():
+    config = smoke_config()
     first, again, other = (encoders.init(jax.random.key(seed), config).params for seed in (0, 0, 1))
     assert set(first) == {"encoder", "decoder"}
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(first))
@@ -86,7 +89,7 @@ def test_parameters_are_nested_dictionaries_of_arrays_drawn_from_the_key():
     assert not np.array_equal(first["encoder"]["dense"]["kernel"], other["encoder"]["dense"]["kernel"])
 
 
-def test_an_image_that_the_convolutions_do_not_divide_is_refused():
+def test_image_size_that_the_strides_do_not_divide_raises_an_error():
     with pytest.raises(ConfigError, match=r"SceneConfig.image_size is 128; allowed: a multiple of 256"):
         Config(encoder=EncoderConfig(channels=(8,) * 7, decoder_size=128))
 
@@ -94,8 +97,8 @@ def test_an_image_that_the_convolutions_do_not_divide_is_refused():
 # -- code -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_code_has_mean_square_one_whatever_the_latent_s_scale_and_is_safe_at_zero():
-    state = encoders.init(jax.random.key(0), small_config())
+def test_code_has_mean_square_one_at_every_scale_and_is_finite_at_zero():
+    state = encoders.init(jax.random.key(0), smoke_config())
     raw = jax.random.normal(jax.random.key(1), (128,))
     code = encoders.code_of(state, raw)
     np.testing.assert_allclose(jnp.mean(code**2), 1.0, rtol=1e-5)
@@ -104,10 +107,10 @@ def test_a_code_has_mean_square_one_whatever_the_latent_s_scale_and_is_safe_at_z
     assert np.all(np.isfinite(jax.jacobian(functools.partial(encoders.code_of, state))(jnp.zeros(128))))
 
 
-def test_the_network_reads_what_the_config_says():
+def test_network_input_follows_the_config():
     depth = jnp.array([[jnp.inf, 0.35], [0.175, 0.525]])
     image = Image(rgb=jnp.full((2, 2, 3), 0.3), depth=depth, geom_id=jnp.array([[-1, 4], [2, 7]]))
-    rgb, depth, silhouette = (encoders.network_input(image, (4, 7), small_config(input=kind)) for kind in INPUTS)
+    rgb, depth, silhouette = (encoders.network_input(image, (4, 7), smoke_config(input=kind)) for kind in INPUTS)
     np.testing.assert_array_equal(rgb, image.rgb)
     np.testing.assert_allclose(depth[..., 0], [[1.0, 0.5], [0.0, 1.0]], atol=1e-6)
     np.testing.assert_array_equal(silhouette[..., 0], [[0.0, 1.0], [0.0, 1.0]])
@@ -117,23 +120,23 @@ def test_the_network_reads_what_the_config_says():
 
 
 @given(st.integers(0, 1000), st.sampled_from([1.0, 0.5, 0.25, 0.1]), st.sampled_from([1.0, 1e-4, 1e3]))
-def test_the_bootstrapped_mean_is_that_of_the_largest_errors(seed, fraction, scale):
+def test_bootstrapped_mean_equals_the_mean_of_the_largest_errors(seed, fraction, scale):
     errors = np.float32(scale * np.random.default_rng(seed).exponential(size=200))
     largest = np.sort(errors)[-round(fraction * 200) :]
     value, gradient = BOOTSTRAPPED(errors, fraction)
     np.testing.assert_allclose(value, largest.mean(), rtol=1e-4)
-    # Bisection may leave out or take in one error that is nearly at the threshold.
+    # Bisection may misplace one error that is nearly equal to the threshold.
     is_largest = errors >= largest[0]
     assert np.sum((gradient > 0) != is_largest) <= 1
     np.testing.assert_allclose(gradient[gradient > 0], 1.0 / (fraction * 200), rtol=1e-5)
 
 
-def test_the_bootstrapped_mean_of_equal_errors_is_their_value():
+def test_bootstrapped_mean_of_equal_errors_is_their_value():
     np.testing.assert_allclose(fit.bootstrapped_mean(jnp.full(16, 0.25), 0.25), 0.25, rtol=1e-4)
     assert fit.bootstrapped_mean(jnp.zeros(16), 0.25) == 0.0
 
 
-def test_whitening_is_symmetric_and_goes_from_the_identity_to_unit_covariance():
+def test_whitening_is_symmetric_and_ranges_from_the_identity_to_unit_covariance():
     mix = jax.random.normal(jax.random.key(0), (6, 6))
     raw = 3.0 + jax.random.normal(jax.random.key(1), (500, 6)) @ mix
     mean, identity = fit.fit_whitening(raw, 0.0)
@@ -147,7 +150,7 @@ def test_whitening_is_symmetric_and_goes_from_the_identity_to_unit_covariance():
     np.testing.assert_allclose(covariance / covariance[0, 0], np.eye(6), atol=5e-3)
 
 
-def test_whitening_leaves_directions_of_noise_small_and_a_constant_latent_alone():
+def test_whitening_bounds_small_eigenvalues_and_is_the_identity_for_a_constant_latent():
     scales = jnp.array([1.0, 1e-6])
     raw = jax.random.normal(jax.random.key(0), (500, 2)) * scales[None]
     _, whitening = fit.fit_whitening(raw, 0.5)
@@ -157,12 +160,12 @@ def test_whitening_leaves_directions_of_noise_small_and_a_constant_latent_alone(
     np.testing.assert_allclose(whitening, np.eye(3), atol=1e-6)
 
 
-# -- learning -------------------------------------------------------------------------------------------------------
+# -- training -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", INPUTS)
-def test_updates_learn_to_draw_the_targets_and_stop_after_num_updates(kind):
-    config = small_config(input=kind, num_updates=150, learning_rate=3e-3)
+def test_updates_reduce_the_loss_and_change_nothing_after_num_updates(kind):
+    config = smoke_config(input=kind, num_updates=150, learning_rate=3e-3)
     shape = (8, 32, 32, network.in_features(config.encoder))
     inputs = jax.random.uniform(jax.random.key(1), shape)
     targets = jax.image.resize(inputs, (8, 16, 16, shape[-1]), "linear")
@@ -185,43 +188,43 @@ def test_updates_learn_to_draw_the_targets_and_stop_after_num_updates(kind):
 
 
 @pytest.mark.parametrize("kind", INPUTS)
-def test_augmented_inputs_differ_by_key_and_stay_in_range(kind):
-    config = small_config(input=kind)
+def test_augmented_inputs_depend_on_the_key_and_stay_in_range(kind):
+    config = smoke_config(input=kind)
     off, on = (0.0, 1.0) if kind == "silhouette" else (0.3, 0.7)
     x = jnp.full((32, 32, network.in_features(config.encoder)), off).at[8:24, 8:24].set(on)
     keys = jax.random.split(jax.random.key(0), 64)
     apply = jax.jit(jax.vmap(lambda key: encoders.augment_input(key, x, x[..., 0] > 0.5, config)))
-    pictures = apply(keys)
-    assert pictures.shape == (64, *x.shape)
-    assert np.all((pictures >= 0.0) & (pictures <= 1.0))
-    assert len(np.unique(np.asarray(pictures).reshape(64, -1), axis=0)) == 64
-    np.testing.assert_array_equal(apply(keys), pictures)
+    inputs = apply(keys)
+    assert inputs.shape == (64, *x.shape)
+    assert np.all((inputs >= 0.0) & (inputs <= 1.0))
+    assert len(np.unique(np.asarray(inputs).reshape(64, -1), axis=0)) == 64
+    np.testing.assert_array_equal(apply(keys), inputs)
     if kind == "silhouette":
-        assert set(np.unique(pictures)) == {0.0, 1.0}
+        assert set(np.unique(inputs)) == {0.0, 1.0}
 
 
-def test_half_of_the_backgrounds_are_replaced_and_the_object_never():
+def test_half_of_the_backgrounds_are_replaced_and_the_object_is_kept():
     x = jnp.full((16, 16, 3), 0.5)
     is_object = jnp.zeros((16, 16), bool).at[4:12, 4:12].set(True)
     keys = jax.random.split(jax.random.key(0), 400)
-    pictures = jax.vmap(augment.replace_background, in_axes=(0, None, None))(keys, x, is_object)
-    assert np.all(pictures[:, 4:12, 4:12] == 0.5)
-    is_replaced = np.any(pictures != 0.5, axis=(1, 2, 3))
-    assert abs(is_replaced.mean() - 0.5) < 4 * 0.5 / np.sqrt(400)  # four standard deviations
-    assert np.all(np.any(pictures[is_replaced] != 0.5, axis=-1)[:, ~is_object])
+    images = jax.vmap(augment.replace_background, in_axes=(0, None, None))(keys, x, is_object)
+    assert np.all(images[:, 4:12, 4:12] == 0.5)
+    is_replaced = np.any(images != 0.5, axis=(1, 2, 3))
+    assert abs(is_replaced.mean() - 0.5) < 4 * 0.5 / np.sqrt(400)  # Four standard deviations.
+    assert np.all(np.any(images[is_replaced] != 0.5, axis=-1)[:, ~is_object])
 
 
-def test_the_colour_matrix_keeps_grey_and_turns_at_most_by_its_limit():
+def test_colour_matrix_keeps_grey_and_limits_the_hue():
     matrices = jax.vmap(augment._color_matrix)(jax.random.split(jax.random.key(0), 100))
     np.testing.assert_allclose(jnp.full(3, 0.4) @ matrices, 0.4, atol=1e-6)
     red = np.array([1.0, -0.5, -0.5])
-    turned = red @ np.asarray(matrices)
-    cosine = turned @ red / np.linalg.norm(turned, axis=-1) / np.linalg.norm(red)
+    rotated = red @ np.asarray(matrices)
+    cosine = rotated @ red / np.linalg.norm(rotated, axis=-1) / np.linalg.norm(red)
     assert np.all(cosine >= np.cos(augment._MAX_HUE) - 1e-5)
     assert cosine.min() < np.cos(0.8 * augment._MAX_HUE)
 
 
-def test_lights_keep_their_distance_and_shine_at_the_centre_from_above():
+def test_random_lights_keep_their_distance_and_shine_at_the_centre_from_above():
     scene = compile_scene(mujoco.MjModel.from_xml_string(LIT_MODEL))
     keys = jax.random.split(jax.random.key(0), 50)
     lights = jax.vmap(encoders.randomize_lights, in_axes=(0, None, None))(keys, scene, CENTER).lights
@@ -234,27 +237,27 @@ def test_lights_keep_their_distance_and_shine_at_the_centre_from_above():
     height = -np.asarray(lights.direction)[..., 2]
     assert np.all(height > 0.499)
     assert height.min() < 0.55
-    assert abs(height.mean() - 0.75) < 0.06  # uniform over the cap: the height is uniform from 1/2 to 1
+    assert abs(height.mean() - 0.75) < 0.06  # Over the cap, the height is uniform from 1/2 to 1.
     ratio = np.asarray(lights.diffuse) / np.asarray(scene.lights.diffuse)
     assert np.all((ratio > 0.4 * 0.85 - 1e-5) & (ratio < 1.3 * 1.15 + 1e-5))
 
 
-def test_a_jittered_camera_stays_in_place_and_looks_a_little_aside():
+def test_jittered_camera_keeps_its_position_and_tilts_within_the_limit():
     camera = Camera(position=jnp.array([0.1, 0.2, 0.3]), rotation=jnp.eye(3), fovy=jnp.float32(0.6))
     jittered = jax.vmap(encoders.jitter_camera, in_axes=(0, None))(jax.random.split(jax.random.key(0), 200), camera)
     np.testing.assert_array_equal(jittered.position, np.tile(camera.position, (200, 1)))
     np.testing.assert_allclose(
         jittered.rotation @ jnp.swapaxes(jittered.rotation, 1, 2), np.tile(np.eye(3), (200, 1, 1)), atol=1e-6
     )
-    aside = np.arccos(np.clip(jittered.rotation[:, 2, 2], -1.0, 1.0))
-    assert 0.04 * 0.6 < aside.max() <= 0.05 * 0.6 * np.sqrt(2) + 1e-4
+    tilt = np.arccos(np.clip(jittered.rotation[:, 2, 2], -1.0, 1.0))
+    assert 0.04 * 0.6 < tilt.max() <= 0.05 * 0.6 * np.sqrt(2) + 1e-4
     assert np.all((jittered.fovy > 0.6 * 0.919) & (jittered.fovy < 0.6 * 1.081))
 
 
-def test_the_target_shows_the_object_alone():
+def test_clean_target_shows_only_the_object():
     is_object = jnp.array([[True, False]])
     for kind, blank in zip(INPUTS, (0.0, 1.0, 0.0), strict=True):
-        config = small_config(input=kind)
+        config = smoke_config(input=kind)
         x = jnp.full((1, 2, network.in_features(config.encoder)), 0.5)
         target = encoders.clean_target(x, is_object, config)
         assert np.all(target[0, 0] == 0.5)

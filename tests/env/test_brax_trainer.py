@@ -1,4 +1,4 @@
-"""brax's own trainer on the environment, neither changed."""
+"""brax's own SAC trainer runs on the environment without changes to either."""
 
 import functools
 
@@ -11,13 +11,13 @@ import vsearch_jax as vs
 CONFIG = vs.Config.preset("smoke")
 
 
-@pytest.mark.slow  # brax compiles the environment for each of its programs: minutes
+@pytest.mark.slow  # brax compiles the environment several times, which takes minutes.
 @pytest.mark.brax_trainer
 @pytest.mark.filterwarnings("ignore:jax.device_put_replicated is deprecated:DeprecationWarning")
-def test_braxs_own_sac_trains_on_it():
+def test_sac_trainer_of_brax_runs_on_the_environment():
     from brax.training.agents.sac import train as brax_sac
 
-    seen = []
+    progress = []
     train = functools.partial(
         brax_sac.train,
         vs.ViewSearchEnv(CONFIG),
@@ -29,10 +29,10 @@ def test_braxs_own_sac_trains_on_it():
         min_replay_size=256,
         grad_updates_per_step=4,
         batch_size=64,
-        progress_fn=lambda steps, metrics: seen.append((steps, metrics["eval/episode_reward"])),
+        progress_fn=lambda steps, metrics: progress.append((steps, metrics["eval/episode_reward"])),
     )
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as brax computes
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # brax relies on both.
         _, params, _ = train()
-    assert seen[-1][0] >= 2000
-    assert all(np.isfinite(reward) for _, reward in seen)
+    assert progress[-1][0] >= 2000
+    assert all(np.isfinite(reward) for _, reward in progress)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))

@@ -1,4 +1,4 @@
-"""The view-search task: the thesis 4.3 line by line, against C MuJoCo's kinematics, and under brax's own wrappers."""
+"""The view-search task against section 4.3 of the thesis, C MuJoCo's kinematics and brax's wrappers."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def step(env):
 
 
 @pytest.fixture
-def as_brax_computes():
-    """brax promotes types and ranks."""
+def with_implicit_promotion():
+    """Allows promotion of types and ranks, which brax relies on."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
-def test_sizes_are_those_of_the_contract(env, reset):
+def test_obs_and_action_have_the_documented_size_and_layout(env, reset):
     assert (env.observation_size, env.action_size) == (265, 2)
     state = reset(jax.random.key(0))
     assert state.obs.shape == (265,)
@@ -50,16 +50,16 @@ def test_sizes_are_those_of_the_contract(env, reset):
     np.testing.assert_array_equal(state.obs, np.concatenate([observation.code, target.code, observation.qpos]))
 
 
-def test_an_arm_without_a_band_is_refused(env):
-    nowhere = env.reach.replace(band=jnp.full(2, jnp.nan))
+def test_missing_band_raises_an_error_naming_arm_and_height(env):
+    without_band = env.reach.replace(band=jnp.full(2, jnp.nan))
     with pytest.raises(ConfigError, match=r"'lwr' .*mount_height 1.355 reaches no elevation at every azimuth"):
-        vs.ViewSearchEnv(CONFIG, env.encoder, nowhere)
-    for run in (vs.train, vs.evaluate):
+        vs.ViewSearchEnv(CONFIG, env.encoder, without_band)
+    for function in (vs.train, vs.evaluate):
         with pytest.raises(ConfigError, match="reaches no elevation"):
-            run(SimpleNamespace(reach=nowhere), CONFIG)
+            function(SimpleNamespace(reach=without_band), CONFIG)
 
 
-def test_initial_view_and_target_are_random_over_the_band(env, reset):
+def test_reset_draws_initial_view_and_target_over_the_whole_band(env, reset):
     keys = jax.random.split(jax.random.key(1), 32)
     states = [reset(key) for key in keys]
     elevations = np.array([s.pipeline_state.observation.view.elevation for s in states])
@@ -70,7 +70,7 @@ def test_initial_view_and_target_are_random_over_the_band(env, reset):
     assert (np.histogram(azimuths, bins=4, range=(-np.pi, np.pi))[0] > 0).all()
 
 
-def test_camera_stands_where_c_mujoco_puts_it_and_within_tolerance_of_the_view(env, reset):
+def test_camera_pose_equals_c_mujoco_and_is_within_tolerance_of_the_view(env, reset):
     observation = reset(jax.random.key(2)).pipeline_state.observation
     model = env.scene.mj_model
     data = mujoco.MjData(model)
@@ -79,11 +79,11 @@ def test_camera_stands_where_c_mujoco_puts_it_and_within_tolerance_of_the_view(e
     np.testing.assert_allclose(observation.camera.position, data.cam_xpos[env.scene.camera_id], atol=1e-5)
     np.testing.assert_allclose(observation.camera.rotation.reshape(-1), data.cam_xmat[env.scene.camera_id], atol=1e-5)
     assert data.ncon == 0
-    wanted = view_pose(observation.view, env.center, env.scene.radius)
-    assert np.linalg.norm(wanted.translation() - observation.camera.position) < CONFIG.ik.position_tolerance
+    commanded = view_pose(observation.view, env.center, env.scene.radius)
+    assert np.linalg.norm(commanded.translation() - observation.camera.position) < CONFIG.ik.position_tolerance
 
 
-def test_a_step_moves_by_the_scaled_action_and_pays_cosine_less_one(env, reset, step):
+def test_step_moves_by_the_scaled_action_and_the_reward_is_cosine_minus_one(env, reset, step):
     state = reset(jax.random.key(3))
     before = state.pipeline_state
     inward = np.sign(np.mean(env.reach.band) - before.observation.view.elevation)
@@ -100,9 +100,9 @@ def test_a_step_moves_by_the_scaled_action_and_pays_cosine_less_one(env, reset, 
     np.testing.assert_allclose(after.reward, expected, atol=1e-6)
 
 
-def test_an_unreachable_view_costs_two_and_the_arm_stays(env, reset, step):
+def test_unreachable_view_gives_reward_minus_two_and_the_arm_stays(env, reset, step):
     state, down = reset(jax.random.key(4)), jnp.array([0.0, -1.0])
-    for _ in range(4):  # the band is less than three steps high
+    for _ in range(4):  # The height of the band is less than three steps.
         before, state = state, step(state, down)
         if state.info["is_reachable"] == 0.0:
             break
@@ -113,27 +113,27 @@ def test_an_unreachable_view_costs_two_and_the_arm_stays(env, reset, step):
     assert state.pipeline_state.num_steps == before.pipeline_state.num_steps + 1
 
 
-def test_after_the_end_nothing_changes(reset, step):
+def test_step_after_done_changes_nothing(reset, step):
     state = reset(jax.random.key(4)).replace(done=jnp.ones(()))
     after = step(state, jnp.array([1.0, 0.0]))
     jax.tree.map(np.testing.assert_array_equal, after, state)
-    going_on = step(state.replace(done=jnp.zeros(())), jnp.array([1.0, 0.0]))
-    assert going_on.metrics["joint_travel"] > 0.0 and going_on.pipeline_state.num_steps == 1
+    running = step(state.replace(done=jnp.zeros(())), jnp.array([1.0, 0.0]))
+    assert running.metrics["joint_travel"] > 0.0 and running.pipeline_state.num_steps == 1
 
 
-def test_the_threshold_terminates_with_two(env, reset, step):
+def test_reaching_the_threshold_terminates_with_reward_two(env, reset, step):
     state = reset(jax.random.key(5))
-    there = env.start(state.pipeline_state.observation, state.pipeline_state.observation)
-    after = step(there, jnp.zeros(2))
+    at_target = env.start(state.pipeline_state.observation, state.pipeline_state.observation)
+    after = step(at_target, jnp.zeros(2))
     assert (after.reward, after.done, after.info["terminated"], after.info["truncated"]) == (2.0, 1.0, 1.0, 0.0)
     errors = pose_error(after.pipeline_state.observation.camera, after.pipeline_state.target.camera)
     assert float(errors[0]) < np.deg2rad(2.0)
     assert float(errors[2]) < 5e-3
 
 
-def test_an_episode_is_truncated_after_its_last_step_and_that_is_not_done(reset, step):
+def test_last_step_sets_truncated_but_not_done(reset, step):
     state = reset(jax.random.key(6))
-    # A target that nothing matches.
+    # The zero code matches no view.
     episode = state.pipeline_state.replace(target=state.pipeline_state.target.replace(code=jnp.zeros(128)))
     state = state.replace(pipeline_state=episode)
     truncated = []
@@ -144,8 +144,8 @@ def test_an_episode_is_truncated_after_its_last_step_and_that_is_not_done(reset,
     assert truncated == [0.0] * (CONFIG.env.episode_length - 1) + [1.0]
 
 
-def test_brax_wrappers_run_it(env, as_brax_computes):
-    # Of silhouettes: without light there is less to compile.
+def test_environment_runs_under_the_wrappers_of_brax(env, with_implicit_promotion):
+    # Silhouettes need no light, so there is less to compile.
     config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, input="silhouette"))
     wrapped = wrap(vs.ViewSearchEnv(config, reach=env.reach), episode_length=3)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))

@@ -1,4 +1,4 @@
-"""Augmented autoencoder: network, domain randomisation, fit."""
+"""The augmented autoencoder (thesis 3.3): network, domain randomisation, training."""
 
 from vsearch_jax.encoder.augment import augment_input, clean_target, jitter_camera, randomize_lights
 from vsearch_jax.encoder.fit import fit_whitening, init, update

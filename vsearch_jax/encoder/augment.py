@@ -1,6 +1,8 @@
-"""Domain randomisation (thesis 3.3): of lights and camera before rendering, of the picture after it."""
+"""Domain randomisation (thesis 3.3): lights and camera before rendering, the image after it."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import dm_pix
 import jax
@@ -12,40 +14,41 @@ from vsearch_jax.config import Config
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.types import Camera
 
-# Lights: greatest angle from the vertical, and ranges of factors of what the scene says.
+# Lights: largest angle from the vertical, and ranges of the factors on the scene's own values.
 _MAX_LIGHT_ANGLE = jnp.pi / 3
 _DIFFUSE_RANGE, _SPECULAR_RANGE, _AMBIENT_RANGE, _TINT_RANGE = (0.4, 1.3), (0.0, 1.5), (0.5, 1.5), (0.85, 1.15)
-# Camera: aim as a part of the field of view, and the factor of the field of view.
+# Camera: largest tilt as a part of the field of view, and range of the factor on the field of view.
 _MAX_SHIFT, _SCALE_RANGE = 0.05, (0.92, 1.08)
-# Picture.
+# Image.
 _BACKGROUND_PROBABILITY = 0.5
-_TEXTURE_GRIDS = (1, 2, 8, 32)  # a colour, a gradient, patches and grain
+_TEXTURE_GRIDS = (1, 2, 8, 32)  # a colour, a gradient, patches, grain
 _NUM_OCCLUSIONS, _OCCLUSION_PROBABILITY, _MAX_OCCLUSION = 2, 0.4, 0.35
 _MAX_HUE, _SATURATION_RANGE, _CONTRAST_RANGE, _MAX_BRIGHTNESS = 0.3, (0.6, 1.4), (0.7, 1.3), 0.15
 _DEPTH_NOISE, _HOLE_FRACTION, _NOISE_GRID = 0.02, 0.02, 32
 
 
 def randomize_lights(key: Array, scene: RenderScene, center: Array) -> RenderScene:
-    """Returns `scene` with other light: each light's place, diffuse, specular and ambient part, and the headlight's.
+    """Returns the scene with random lights and a random headlight.
 
-    A light keeps its distance from `center` and shines at it, from up to 60 degrees off the vertical, uniform over that
-    cap.
+    Each light gets a new position and new diffuse, specular and ambient colours. It keeps its distance from `center`
+    and shines at it. Its direction is uniform over the cap within 60 degrees of the vertical.
 
     Args:
       key: PRNG key.
       scene: RenderScene.
-      center: f32[3] m in world, the middle of the view sphere.
+      center: f32[3] m in world, centre of the view sphere.
     """
-    height_key, turn_key, diffuse_key, tint_key, specular_key, ambient_key, headlight_key = jax.random.split(key, 7)
+    height_key, azimuth_key, diffuse_key, tint_key, specular_key, ambient_key, headlight_key = jax.random.split(key, 7)
     lights = scene.lights
     shape = lights.position.shape[:1]
     height = jax.random.uniform(height_key, shape, minval=jnp.cos(_MAX_LIGHT_ANGLE), maxval=1.0)
-    turn = jax.random.uniform(turn_key, shape, maxval=2.0 * jnp.pi)
+    azimuth = jax.random.uniform(azimuth_key, shape, maxval=2.0 * jnp.pi)
     across = jnp.sqrt(1.0 - height**2)
-    upward = jnp.stack([across * jnp.cos(turn), across * jnp.sin(turn), height], axis=-1)
+    upward = jnp.stack([across * jnp.cos(azimuth), across * jnp.sin(azimuth), height], axis=-1)
     distance = jnp.linalg.norm(lights.position - center[None], axis=-1, keepdims=True)
     tint = _uniform(tint_key, (*shape, 3), _TINT_RANGE)
-    lights = lights.replace(  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
+    lights = dataclasses.replace(
+        lights,
         position=center[None] + distance * upward,
         direction=-upward,
         diffuse=lights.diffuse * tint * _uniform(diffuse_key, (*shape, 1), _DIFFUSE_RANGE),
@@ -53,7 +56,8 @@ def randomize_lights(key: Array, scene: RenderScene, center: Array) -> RenderSce
         ambient=lights.ambient * _uniform(ambient_key, (*shape, 1), _AMBIENT_RANGE),
     )
     factor = _uniform(headlight_key, (), _AMBIENT_RANGE)
-    return scene.replace(  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
+    return dataclasses.replace(
+        scene,
         lights=lights,
         headlight_ambient=scene.headlight_ambient * factor,
         headlight_diffuse=scene.headlight_diffuse * factor,
@@ -61,66 +65,88 @@ def randomize_lights(key: Array, scene: RenderScene, center: Array) -> RenderSce
 
 
 def jitter_camera(key: Array, camera: Camera) -> Camera:
-    """Returns `camera` aimed a little aside and zoomed: the picture shifts by up to 5 % and scales by up to 8 %.
+    """Returns the camera with a random tilt and zoom: the image shifts by up to 5 % and scales by up to 8 %.
 
-    Shift and scale so cost nothing; resampling a picture takes longer than all other operations on it together.
-    """
-    aim_key, scale_key = jax.random.split(key)
-    tilt = jax.random.uniform(aim_key, (2,), minval=-_MAX_SHIFT, maxval=_MAX_SHIFT) * camera.fovy
-    turn = SO3.exp(jnp.append(tilt, 0.0)).as_matrix()
-    fovy = camera.fovy * _uniform(scale_key, (), _SCALE_RANGE)
-    return camera.replace(rotation=camera.rotation @ turn, fovy=fovy)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
-
-
-def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Array:
-    """Returns the network's input with the faults that the encoder must learn to ignore.
-
-    Every input gets another background in half of the cases, and occlusions. rgb then gets another hue, saturation,
-    contrast and brightness; depth gets noise and holes; a silhouette gets spots on and off the object.
+    This costs no time. To resample the rendered image takes longer than all other operations on it together.
 
     Args:
       key: PRNG key.
-      x: f32[H, W, C] in [0, 1] from `network_input`.
-      is_object: bool[H, W], where the object is.
-      config: the run's.
+      camera: the Camera; its position does not change.
+    """
+    tilt_key, scale_key = jax.random.split(key)
+    tilt = jax.random.uniform(tilt_key, (2,), minval=-_MAX_SHIFT, maxval=_MAX_SHIFT) * camera.fovy
+    rotation = SO3.exp(jnp.append(tilt, 0.0)).as_matrix()
+    fovy = camera.fovy * _uniform(scale_key, (), _SCALE_RANGE)
+    return dataclasses.replace(camera, rotation=camera.rotation @ rotation, fovy=fovy)
+
+
+def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Array:
+    """Adds random disturbances to the encoder's input. The encoder must learn to ignore them.
+
+    Each kind of input gets occlusions. rgb and depth get a random background with probability 1/2. Then rgb gets random
+    hue, saturation, contrast and brightness; depth gets noise and holes; a silhouette gets inverted spots.
+
+    Args:
+      key: PRNG key.
+      x: f32[H, W, C] in [0, 1], from `network_input`.
+      is_object: bool[H, W], true on the object.
+      config: the run's config.
 
     Returns:
       f32[H, W, C] in [0, 1].
     """
     background_key, occlusion_key, sensor_key = jax.random.split(key, 3)
     if config.encoder.input == "silhouette":
-        return _spoil_silhouette(sensor_key, jnp.round(occlude(occlusion_key, x)))
+        return _disturb_silhouette(sensor_key, jnp.round(occlude(occlusion_key, x)))
     x = occlude(occlusion_key, replace_background(background_key, x, is_object))
-    spoil = _spoil_rgb if config.encoder.input == "rgb" else _spoil_depth
-    return jnp.clip(spoil(sensor_key, x), 0.0, 1.0)
+    disturb = _disturb_rgb if config.encoder.input == "rgb" else _disturb_depth
+    return jnp.clip(disturb(sensor_key, x), 0.0, 1.0)
 
 
 def clean_target(x: Array, is_object: Array, config: Config) -> Array:
-    """Returns what the decoder is to draw: `x` (f32[h, w, C]) with all but the object black, or far for depth."""
+    """Returns the target of the decoder: the input with everything but the object black, or far for depth.
+
+    Args:
+      x: f32[h, w, C] in [0, 1], from `network_input`.
+      is_object: bool[h, w], true on the object.
+      config: the run's config.
+    """
     blank = 1.0 if config.encoder.input == "depth" else 0.0
     return jnp.where(is_object[..., None], x, blank)
 
 
 def replace_background(key: Array, x: Array, is_object: Array) -> Array:
-    """Returns `x` (f32[H, W, C]), in half of the cases with a texture where `is_object` (bool[H, W]) is false."""
+    """Returns the input, with probability 1/2 with a random texture behind the object.
+
+    Args:
+      key: PRNG key.
+      x: f32[H, W, C] in [0, 1].
+      is_object: bool[H, W], true on the object.
+    """
     choice_key, texture_key = jax.random.split(key)
     is_replaced = jax.random.bernoulli(choice_key, _BACKGROUND_PROBABILITY)
     return jnp.where(is_replaced & ~is_object[..., None], _texture(texture_key, x.shape), x)
 
 
 def occlude(key: Array, x: Array) -> Array:
-    """Returns `x` (f32[H, W, C]) with up to two rectangles of random place, size and colour."""
+    """Returns the input with up to two rectangles of random position, size and colour.
+
+    Args:
+      key: PRNG key.
+      x: f32[H, W, C] in [0, 1].
+    """
     height, width, features = x.shape
     numbers = jax.random.uniform(key, (_NUM_OCCLUSIONS, 5 + features))
-    for is_there, row, column, half_height, half_width, *color in numbers:
+    for chance, row, column, half_height, half_width, *color in numbers:
         rows = jnp.abs(_pixel_centers(height) - row) < 0.5 * _MAX_OCCLUSION * half_height
         columns = jnp.abs(_pixel_centers(width) - column) < 0.5 * _MAX_OCCLUSION * half_width
-        is_inside = rows[:, None] & columns[None, :] & (is_there < _OCCLUSION_PROBABILITY)
+        is_inside = rows[:, None] & columns[None, :] & (chance < _OCCLUSION_PROBABILITY)
         x = jnp.where(is_inside[..., None], jnp.stack(color)[None, None], x)
     return x
 
 
-def _spoil_rgb(key: Array, x: Array) -> Array:
+def _disturb_rgb(key: Array, x: Array) -> Array:
+    """Returns the rgb input f32[H, W, 3] with random hue, saturation, contrast and brightness."""
     color_key, contrast_key, brightness_key = jax.random.split(key, 3)
     x = x @ _color_matrix(color_key)
     contrasted = dm_pix.random_contrast(contrast_key, x, *_CONTRAST_RANGE)
@@ -128,27 +154,32 @@ def _spoil_rgb(key: Array, x: Array) -> Array:
 
 
 def _color_matrix(key: Array) -> Array:
-    """Returns f32[3, 3], by which a pixel's rgb is multiplied from the right to turn its hue and scale its saturation.
+    """Returns a random f32[3, 3] for hue and saturation; a row of rgb is multiplied by it from the right.
 
-    Hue turns about the grey axis, saturation scales across it, so that grey stays. dm-pix goes by way of HSV, which XLA
-    on CPU evaluates anew for each use: with it, `augment_input` takes 15 times as long.
+    Hue is a rotation about the grey axis. Saturation is a scale across this axis. Grey does not change.
+    dm-pix converts to HSV instead. XLA on CPU computes the HSV again for each use, which makes `augment_input`
+    15 times slower.
     """
     hue_key, saturation_key = jax.random.split(key)
     angle = _MAX_HUE * jax.random.uniform(hue_key, minval=-1.0, maxval=1.0)
     saturation = _uniform(saturation_key, (), _SATURATION_RANGE)
     grey = jnp.full((3, 3), 1.0 / 3.0)
-    turn = SO3.exp(angle * jnp.full(3, 3.0**-0.5)).as_matrix()
-    return grey + saturation * (turn - grey)
+    rotation = SO3.exp(angle * jnp.full(3, 3.0**-0.5)).as_matrix()
+    return grey + saturation * (rotation - grey)
 
 
-def _spoil_depth(key: Array, x: Array) -> Array:
-    """Adds noise in patches, as a stereo sensor's, and holes, which such sensors report as far."""
+def _disturb_depth(key: Array, x: Array) -> Array:
+    """Returns the depth input f32[H, W, 1] with patches of noise and with holes, as of a stereo sensor.
+
+    A hole has the value 1 (far), as such sensors report it.
+    """
     noise_key, hole_key = jax.random.split(key)
     x = x + _DEPTH_NOISE * (2.0 * _noise(noise_key, x.shape, _NOISE_GRID) - 1.0)
     return jnp.where(_spots(hole_key, x.shape), 1.0, x)
 
 
-def _spoil_silhouette(key: Array, x: Array) -> Array:
+def _disturb_silhouette(key: Array, x: Array) -> Array:
+    """Returns the silhouette f32[H, W, 1], inverted in some small spots."""
     return jnp.where(_spots(key, x.shape), 1.0 - x, x)
 
 
@@ -173,11 +204,15 @@ def _texture(key: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _noise(key: Array, shape: tuple[int, ...], grid: int) -> Array:
-    """Returns noise in [0, 1] on a grid, linear between: a number for every pixel takes longer than encoding it."""
+    """Returns noise in [0, 1] of `shape` (H, W, C), drawn on a coarse grid and interpolated.
+
+    To draw a number for every pixel takes longer than to encode the image.
+    """
     return jax.image.resize(jax.random.uniform(key, (grid, grid, shape[-1])), shape, "linear")
 
 
 def _pixel_centers(count: int) -> Array:
+    """Returns f32[count], centres of the pixels of a row or column of length 1."""
     return (jnp.arange(count, dtype=jnp.float32) + 0.5) / count
 
 

@@ -1,6 +1,9 @@
-"""Fitting the autoencoder: bootstrapped L2 with Adam, then the mean and the partial whitening of its latent."""
+"""Training of the autoencoder: bootstrapped L2 loss with Adam, then mean and partial whitening of the latent."""
 
 from __future__ import annotations
+
+import dataclasses
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -9,34 +12,48 @@ from jax import Array
 
 from vsearch_jax.config import Config
 from vsearch_jax.encoder import network
-from vsearch_jax.types import EncoderState
+from vsearch_jax.types import EncoderState, ParamTree
 
-_BISECTIONS = 16  # the threshold is then known to the largest error / 65,536, and the loss to the square of that
-_EIGENVALUE_FLOOR = 1e-2  # smaller ones are mostly noise: shadows of other arm joints, light
+_NUM_BISECTIONS = 16
+"""The threshold is then exact to the largest error / 65,536, and the loss to the square of that."""
+_EIGENVALUE_FLOOR = 1e-2
+"""Smallest relative eigenvalue. Smaller eigenvalues are mostly noise: shadows of the other arm links, light."""
 
 
 def init(key: Array, config: Config) -> EncoderState:
-    """Returns an untrained autoencoder whose code is the raw latent: mean zero, whitening the identity."""
+    """Returns an untrained autoencoder. Its latent mean is zero and its whitening is the identity.
+
+    Args:
+      key: PRNG key of the parameters.
+      config: the run's config.
+    """
     params = network.init_params(key, config)
     size = config.encoder.code_size
     return EncoderState(params, optimizer(config).init(params), jnp.zeros(size), jnp.eye(size))
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Returns Adam with a step size that falls by a cosine to zero over `num_updates`."""
+    """Returns Adam with a cosine decay of the learning rate to zero over `num_updates`."""
     return optax.adam(optax.cosine_decay_schedule(config.encoder.learning_rate, config.encoder.num_updates))
 
 
 def bootstrapped_mean(errors: Array, fraction: float) -> Array:
-    """Returns the mean of the largest `fraction` of `errors` (f32[N], none negative).
+    """Computes the mean of the largest errors.
 
-    It is the least value over t of t + mean(max(errors - t, 0)) / fraction (Rockafellar and Uryasev 2000, conditional
-    value at risk), taken at the t that bisection finds: 15 times faster than `top_k` on CPU. At the optimum the
-    derivative by t is zero, so t takes no part in the gradient.
+    This mean is the minimum over t of t + mean(max(errors - t, 0)) / fraction, the conditional value at risk
+    (Rockafellar and Uryasev 2000). Bisection finds t. It is 15 times faster than `top_k` on CPU. The gradient ignores
+    t, because the derivative with respect to t is zero at the minimum.
+
+    Args:
+      errors: f32[N], none negative.
+      fraction: part of the errors to average, in (0, 1].
+
+    Returns:
+      f32[].
     """
     fixed = jax.lax.stop_gradient(errors)
     low, high = jnp.zeros(()), jnp.max(fixed)
-    for _ in range(_BISECTIONS):
+    for _ in range(_NUM_BISECTIONS):
         middle = 0.5 * (low + high)
         is_low = jnp.mean(fixed > middle) > fraction
         low, high = jnp.where(is_low, middle, low), jnp.where(is_low, high, middle)
@@ -44,14 +61,17 @@ def bootstrapped_mean(errors: Array, fraction: float) -> Array:
     return threshold + jnp.mean(jnp.maximum(errors - threshold, 0.0)) / fraction
 
 
-def reconstruction_loss(params: network.Params, x: Array, target: Array, config: Config) -> Array:
-    """Returns the bootstrapped L2 loss f32[] of one view.
+def reconstruction_loss(params: ParamTree, x: Array, target: Array, config: Config) -> Array:
+    """Computes the bootstrapped L2 loss of one view.
 
     Args:
-      params: of encoder and decoder.
-      x: f32[H, W, C], the augmented input.
-      target: f32[h, w, C], the clean picture, `decoder_size` high and wide.
-      config: the run's.
+      params: parameters of encoder and decoder.
+      x: f32[H, W, C], augmented input.
+      target: f32[h, w, C], clean image; h and w are `decoder_size`.
+      config: the run's config.
+
+    Returns:
+      f32[].
     """
     latent = network.raw_latent(params, x, config)
     errors = jnp.mean((network.reconstruct(params, latent, config) - target) ** 2, axis=-1)
@@ -59,42 +79,43 @@ def reconstruction_loss(params: network.Params, x: Array, target: Array, config:
 
 
 def update(encoder: EncoderState, inputs: Array, targets: Array, config: Config) -> tuple[EncoderState, Array]:
-    """Returns the autoencoder after one step of Adam on a batch.
+    """Does one step of Adam on a batch.
 
     Args:
-      encoder: EncoderState; mean and whitening are left as they are.
+      encoder: EncoderState; mean and whitening do not change.
       inputs: f32[B, H, W, C], augmented views.
-      targets: f32[B, h, w, C], the same views clean, `decoder_size` high and wide.
-      config: the run's.
+      targets: f32[B, h, w, C], clean images of the same views; h and w are `decoder_size`.
+      config: the run's config.
 
     Returns:
-      EncoderState, and the mean loss f32[] before the step.
+      The new EncoderState, and the mean loss f32[] before the step.
     """
 
-    def batch_loss(params: network.Params) -> Array:
+    def batch_loss(params: ParamTree) -> Array:
         losses = jax.vmap(reconstruction_loss, in_axes=(None, 0, 0, None))(params, inputs, targets, config)
         return jnp.mean(losses)
 
     loss, gradients = jax.value_and_grad(batch_loss)(encoder.params)
-    with jax.numpy_dtype_promotion("standard"):  # optax raises floats to the power of its integer count
+    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to the power of its integer step count
         updates, opt_state = optimizer(config).update(gradients, encoder.opt_state)
-    params = optax.apply_updates(encoder.params, updates)
-    return encoder.replace(params=params, opt_state=opt_state), loss  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
+    # optax keeps the structure of the parameters, but its type is any tree.
+    params = cast(ParamTree, optax.apply_updates(encoder.params, updates))
+    return dataclasses.replace(encoder, params=params, opt_state=opt_state), loss
 
 
 def fit_whitening(raw: Array, power: float) -> tuple[Array, Array]:
-    """Returns mean and partial whitening of raw latents, to be kept in EncoderState.
+    """Computes mean and partial whitening of raw latents: `latent_mean` and `whitening` of EncoderState.
 
-    Whitening is the symmetric matrix with the covariance's eigenvectors and its eigenvalues to the power -`power`.
-    Small eigenvalues count as 1e-2 of the largest, so that directions of noise are not blown up. The overall scale
-    means nothing to a cosine; it is chosen so that the largest variance keeps its size.
+    The whitening matrix is symmetric. It has the eigenvectors of the covariance, and the eigenvalues of the covariance
+    to the power -`power`. Eigenvalues below 1e-2 of the largest count as 1e-2 of it, so that noise is not amplified.
+    The overall scale does not change a cosine; the scale here keeps the largest variance as it is.
 
     Args:
-      raw: f32[N, Z], of random reachable views.
-      power: 0 gives the identity, 1/2 unit variance in every direction.
+      raw: f32[N, Z], raw latents of random reachable views.
+      power: 0 gives the identity, 1/2 gives unit variance in every direction.
 
     Returns:
-      f32[Z] mean and f32[Z, Z] whitening; the identity where all latents are equal.
+      Mean f32[Z] and whitening f32[Z, Z]. The whitening is the identity if all latents are equal.
     """
     mean = jnp.mean(raw, axis=0)
     centred = raw - mean[None]

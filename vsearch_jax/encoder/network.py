@@ -1,11 +1,14 @@
-"""The autoencoder: strided convolutions to a latent, sub-pixel matmuls back to a picture; one in, batch by vmap."""
+"""The networks of the autoencoder.
+
+The encoder maps an image to a latent by strided convolutions. The decoder maps a latent to an image by sub-pixel
+upsampling. Both take one item; batch them with `jax.vmap`.
+"""
 
 from __future__ import annotations
 
 import functools
 import itertools
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,21 +16,28 @@ from flax import nnx
 from jax import Array
 
 from vsearch_jax.config import Config, EncoderConfig
-from vsearch_jax.types import EncoderState, Image
-
-Params = dict[str, Any]
+from vsearch_jax.types import EncoderState, Image, ParamTree
 
 
 def convolution_by_xla(x: Array, kernel: Array, stride: int) -> Array:
-    """Returns XLA's own strided convolution with "SAME" padding: f32[H, W, C], f32[k, k, C, K] -> f32[H/s, W/s, K]."""
+    """Computes a strided convolution with "SAME" padding by XLA's own operation.
+
+    Args:
+      x: f32[H, W, C]; H and W are multiples of `stride`.
+      kernel: f32[k, k, C, K].
+      stride: s.
+
+    Returns:
+      f32[H/s, W/s, K].
+    """
     dimensions = ("NHWC", "HWIO", "NHWC")
     return jax.lax.conv_general_dilated(x[None], kernel, (stride, stride), "SAME", dimension_numbers=dimensions)[0]
 
 
 def convolution_by_matmul(x: Array, kernel: Array, stride: int) -> Array:
-    """Returns what `convolution_by_xla` does, as copies of slices and one matmul.
+    """Computes the convolution of `convolution_by_xla` by slices and one matmul.
 
-    On CPU, XLA differentiates it faster than its own convolution, which in a loop falls back to a single-threaded one.
+    It is faster on CPU: XLA's own convolution runs on a single thread inside a loop, and its backward pass is slow.
 
     Args:
       x: f32[H, W, C]; H and W are multiples of `stride`.
@@ -42,7 +52,7 @@ def convolution_by_matmul(x: Array, kernel: Array, stride: int) -> Array:
     before = (size - stride) // 2
     x = jnp.pad(x, ((before, size - stride - before), (before, size - stride - before), (0, 0)))
     if size == 2 * stride:
-        # Blocks of s x s pixels, then each block with its neighbours right, below and diagonal: few, wide copies.
+        # The kernel covers 2 x 2 blocks of s x s pixels, so four wide slices replace k * k narrow ones.
         x = x.reshape(height + 1, stride, width + 1, stride, in_features)
         x = x.transpose(0, 2, 1, 3, 4).reshape(height + 1, width + 1, stride * stride * in_features)
         taps = [x[i : i + height, j : j + width] for i in range(2) for j in range(2)]
@@ -54,9 +64,18 @@ def convolution_by_matmul(x: Array, kernel: Array, stride: int) -> Array:
 
 
 class StridedConvolution(nnx.Module):
-    """A convolution with a stride: as a matmul on CPU, XLA's own elsewhere."""
+    """A convolution with a stride: by matmul on CPU, by XLA's own operation on other platforms."""
 
     def __init__(self, in_features: int, out_features: int, kernel_size: int, stride: int, *, rngs: nnx.Rngs) -> None:
+        """Draws the parameters.
+
+        Args:
+          in_features: number of input channels.
+          out_features: number of output channels.
+          kernel_size: k, height and width of the kernel in pixels.
+          stride: s, in pixels.
+          rngs: random numbers for the parameters.
+        """
         shape = (kernel_size, kernel_size, in_features, out_features)
         self.kernel = nnx.Param(jax.nn.initializers.he_normal()(rngs.params(), shape))
         self.bias = nnx.Param(jnp.zeros(out_features))
@@ -69,9 +88,16 @@ class StridedConvolution(nnx.Module):
 
 
 class SubPixelUpsampling(nnx.Module):
-    """Twice the height and width: a matmul gives each cell the features of its four quarters (Shi et al. 2016)."""
+    """Doubles height and width: a matmul maps each cell to the features of its four quarters (Shi et al. 2016)."""
 
     def __init__(self, in_features: int, out_features: int, *, rngs: nnx.Rngs) -> None:
+        """Draws the parameters.
+
+        Args:
+          in_features: number of input channels.
+          out_features: number of output channels.
+          rngs: random numbers for the parameters.
+        """
         self.linear = nnx.Linear(in_features, 4 * out_features, kernel_init=jax.nn.initializers.he_normal(), rngs=rngs)
 
     def __call__(self, x: Array) -> Array:
@@ -82,14 +108,21 @@ class SubPixelUpsampling(nnx.Module):
 
 
 def in_features(config: EncoderConfig) -> int:
-    """Returns the channels of the network's input: 3 for rgb, 1 for depth and silhouette."""
+    """Returns the number of input channels: 3 for rgb, 1 for depth and silhouette."""
     return 3 if config.input == "rgb" else 1
 
 
 class Encoder(nnx.Module):
-    """Picture to raw latent."""
+    """Maps an image to its raw latent."""
 
     def __init__(self, config: EncoderConfig, image_size: int, *, rngs: nnx.Rngs) -> None:
+        """Draws the parameters.
+
+        Args:
+          config: kind of input, channels, kernel size, strides and code size.
+          image_size: height and width of the image in pixels.
+          rngs: random numbers for the parameters.
+        """
         sizes = [2 * config.stem_stride if config.stem_stride > 2 else config.kernel_size]
         sizes += [config.kernel_size] * (len(config.channels) - 1)
         strides = [config.stem_stride] + [2] * (len(config.channels) - 1)
@@ -107,9 +140,15 @@ class Encoder(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """Raw latent to the clean picture."""
+    """Maps a raw latent to the clean image."""
 
     def __init__(self, config: EncoderConfig, *, rngs: nnx.Rngs) -> None:
+        """Draws the parameters.
+
+        Args:
+          config: kind of input, channels, code size and decoder size.
+          rngs: random numbers for the parameters.
+        """
         self.shape = (config.decoder_size // 2 ** len(config.channels),) * 2 + (config.channels[-1],)
         self.dense = nnx.Linear(
             config.code_size, math.prod(self.shape), kernel_init=jax.nn.initializers.he_normal(), rngs=rngs
@@ -118,7 +157,7 @@ class Decoder(nnx.Module):
         self.upsamplings = nnx.List([SubPixelUpsampling(a, b, rngs=rngs) for a, b in itertools.pairwise(channels)])
 
     def __call__(self, latent: Array) -> Array:
-        """Returns the picture f32[decoder_size, decoder_size, C] of `latent`, f32[Z]."""
+        """Returns the image f32[decoder_size, decoder_size, C] in [0, 1] of `latent`, f32[Z]."""
         x = self.dense(latent).reshape(self.shape)
         for upsampling in self.upsamplings:
             x = upsampling(jax.nn.relu(x))
@@ -126,21 +165,31 @@ class Decoder(nnx.Module):
 
 
 def build(key: Array, config: Config) -> tuple[Encoder, Decoder]:
-    """Returns the two modules with parameters drawn from `key`."""
+    """Builds encoder and decoder with random parameters.
+
+    Args:
+      key: PRNG key of the parameters.
+      config: the run's config; its encoder part and the image size are used.
+    """
     encoder_key, decoder_key = jax.random.split(key)
     encoder = Encoder(config.encoder, config.scene.image_size, rngs=nnx.Rngs(encoder_key))
     return encoder, Decoder(config.encoder, rngs=nnx.Rngs(decoder_key))
 
 
 @functools.cache
-def _graphs(config: Config) -> tuple[nnx.GraphDef, nnx.GraphDef]:
-    """Returns the static halves of encoder and decoder."""
+def _graphs(config: Config) -> tuple[nnx.GraphDef[Encoder], nnx.GraphDef[Decoder]]:
+    """Returns the graph definitions of encoder and decoder: the modules without their parameters."""
     encoder, decoder = nnx.eval_shape(lambda: build(jax.random.key(0), config))
     return nnx.graphdef(encoder), nnx.graphdef(decoder)
 
 
-def init_params(key: Array, config: Config) -> Params:
-    """Returns fresh parameters as nested dictionaries of arrays, `encoder` and `decoder` apart."""
+def init_params(key: Array, config: Config) -> ParamTree:
+    """Returns random parameters under the names `encoder` and `decoder`.
+
+    Args:
+      key: PRNG key of the parameters.
+      config: the run's config; its encoder part and the image size are used.
+    """
     encoder, decoder = build(key, config)
     return {
         "encoder": nnx.to_pure_dict(nnx.state(encoder)),
@@ -148,41 +197,78 @@ def init_params(key: Array, config: Config) -> Params:
     }
 
 
-def raw_latent(params: Params, x: Array, config: Config) -> Array:
-    """Returns the encoder's raw latent f32[Z] of the input `x`, f32[H, W, C] from `network_input`."""
+def raw_latent(params: ParamTree, x: Array, config: Config) -> Array:
+    """Computes the raw latent of an input.
+
+    Args:
+      params: parameters of encoder and decoder.
+      x: f32[H, W, C] in [0, 1], from `network_input`.
+      config: the run's config.
+
+    Returns:
+      f32[Z].
+    """
     return nnx.merge(_graphs(config)[0], params["encoder"])(x)
 
 
-def reconstruct(params: Params, latent: Array, config: Config) -> Array:
-    """Returns the decoder's picture f32[decoder_size, decoder_size, C] in [0, 1] of a raw latent f32[Z]."""
+def reconstruct(params: ParamTree, latent: Array, config: Config) -> Array:
+    """Decodes a raw latent to the clean image.
+
+    Args:
+      params: parameters of encoder and decoder.
+      latent: f32[Z], raw latent.
+      config: the run's config.
+
+    Returns:
+      f32[decoder_size, decoder_size, C] in [0, 1].
+    """
     return nnx.merge(_graphs(config)[1], params["decoder"])(latent)
 
 
 def code_of(encoder: EncoderState, raw: Array) -> Array:
-    """Returns the code that searchers compare and the policy reads, f32[Z], of a raw latent f32[Z].
+    """Computes the code of a raw latent. Searchers compare codes, and the policy reads them.
 
-    The code is the raw latent without its mean, partially whitened, scaled to mean square 1 (norm sqrt(Z)); an all-zero
-    code stays zero, with finite gradients.
+    The code is the raw latent minus its mean, partially whitened, and scaled to mean square 1 (norm sqrt(Z)).
+    An all-zero code stays zero, and its gradients are finite.
+
+    Args:
+      encoder: EncoderState with mean and whitening.
+      raw: f32[Z], raw latent.
+
+    Returns:
+      f32[Z].
     """
     code = encoder.whitening @ (raw - encoder.latent_mean)
     return code * jax.lax.rsqrt(jnp.maximum(jnp.mean(code**2), 1e-12))
 
 
 def encode(encoder: EncoderState, x: Array, config: Config) -> Array:
-    """Returns the code f32[Z] (see `code_of`) of the input `x`, f32[H, W, C] from `network_input`."""
+    """Computes the code of an input; see `code_of`.
+
+    Args:
+      encoder: EncoderState.
+      x: f32[H, W, C] in [0, 1], from `network_input`.
+      config: the run's config.
+
+    Returns:
+      f32[Z].
+    """
     return code_of(encoder, raw_latent(encoder.params, x, config))
 
 
 def network_input(image: Image, object_geom_ids: Array | tuple[int, ...], config: Config) -> Array:
-    """Returns of an image what the config lets the encoder read, f32[H, W, C] in [0, 1].
+    """Converts an image to the encoder's input. `config.encoder.input` is its kind.
 
-    rgb is taken as it is. Depth d becomes d/radius - 1/2, limited to [0, 1]: half a sphere's radius before and behind
-    its centre; what is nearer, farther or a miss is at the limit. The silhouette is 1 on the object.
+    rgb: the image's colours. silhouette: 1 on the object, 0 elsewhere. depth: d / radius - 1/2, clipped to [0, 1], so
+    the range is half a radius of the view sphere before and behind its centre. A miss is 1.
 
     Args:
-      image: Image of H x W.
-      object_geom_ids: i32[G], MuJoCo's numbers of the object's geoms.
-      config: the run's.
+      image: Image of H x W pixels.
+      object_geom_ids: i32[G], MuJoCo's geom numbers of the object.
+      config: the run's config.
+
+    Returns:
+      f32[H, W, C] in [0, 1].
     """
     if config.encoder.input == "rgb":
         return image.rgb

@@ -1,58 +1,159 @@
-"""What an episode carries, and how far its views are from the target's."""
+"""State of an episode, the policy's input, the reward, and the errors of a view."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from typing import cast
+
 import jax.numpy as jnp
 import numpy as np
+from brax import base
 from brax.envs.base import State
 from jax import Array
 from jax.core import Tracer
 
-from vsearch_jax.config import Config, ConfigError
-from vsearch_jax.geometry import frobenius_angle, rotation_error
-from vsearch_jax.types import Camera, EpisodeState, ReachabilityMap
+from vsearch_jax.config import Config, ConfigError, EnvConfig
+from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
+from vsearch_jax.planning import Motion
+from vsearch_jax.types import Camera, EpisodeState, Observation, ReachabilityMap, View
+from vsearch_jax.xla.tree import tree_where
 
 
 class UnreachableError(ConfigError):
-    """The arm does not reach the views that are wanted.
+    """The arm does not reach the views that the config asks for.
 
     Attributes:
-      reach: the arm's reachability map.
+      reach: ReachabilityMap of the arm.
     """
 
     def __init__(self, message: str, reach: ReachabilityMap) -> None:
-        """Keeps the map beside the message."""
+        """Stores the map beside the message."""
         super().__init__(message)
         self.reach = reach
 
 
 def check_band(reach: ReachabilityMap, config: Config) -> None:
-    """Checks that there is a band to search; does nothing under a trace.
+    """Checks that there is a band to search. Does nothing while JAX traces, because values are unknown then.
+
+    Args:
+      reach: ReachabilityMap of the arm.
+      config: the run's config; the message names its arm, mount height and object.
 
     Raises:
-      ConfigError: the arm reaches no elevation at every azimuth.
+      UnreachableError: there is no elevation that the arm reaches at every azimuth.
     """
     if not isinstance(reach.band, Tracer) and np.isnan(reach.band).any():
         raise UnreachableError(
             f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
-            f"at every azimuth around object {config.scene.object!r}; `vsearch reach` draws what it does reach, and "
-            "proposes a mount_height",
+            f"at every azimuth around object {config.scene.object!r}; run `vsearch reach`: it draws the views that the "
+            "arm reaches and proposes a mount height (--scene.mount-height)",
             reach,
         )
 
 
 def episode_of(state: State) -> EpisodeState:
-    """Returns the episode that a brax State carries."""
-    return state.pipeline_state  # pyright: ignore[reportReturnType] # brax lets any pytree stand here
+    """Returns the EpisodeState in a brax State."""
+    # brax declares its own physics state here, but never reads it and accepts any pytree.
+    return cast(EpisodeState, state.pipeline_state)
+
+
+def obs_of(state: State) -> Array:
+    """Returns the policy's flat input vector f32[D] in a brax State of this task."""
+    # brax also allows a mapping of arrays; this task never makes one.
+    return cast(Array, state.obs)
 
 
 def build_obs(episode: EpisodeState) -> Array:
-    """Returns the observation: code, target code, joints."""
+    """Returns the policy's flat input vector f32[D]: code, target code, joint values."""
     return jnp.concatenate([episode.observation.code, episode.target.code, episode.observation.qpos])
 
 
+def start_state(observation: Observation, target: Observation) -> State:
+    """Returns the brax State at the start of an episode.
+
+    Args:
+      observation: Observation from the initial view.
+      target: Observation from the target view.
+    """
+    episode = EpisodeState(observation=observation, target=target, num_steps=jnp.zeros((), jnp.int32))
+    zero = jnp.zeros(())
+    info = {"terminated": zero, "truncated": zero, "is_reachable": jnp.ones(())}
+    metrics = {"similarity": cosine_similarity(observation.code, target.code), "unreachable": zero}
+    metrics |= {"joint_travel": zero, "motion_time": zero}
+    return State(
+        pipeline_state=_as_pipeline_state(episode),
+        obs=build_obs(episode),
+        reward=zero,
+        done=zero,
+        metrics=metrics,
+        info=info,
+    )
+
+
+def next_state(state: State, observation: Observation, motion: Motion, config: EnvConfig) -> State:
+    """Returns the brax State after one step: observation, reward, termination and metrics.
+
+    Args:
+      state: brax State before the step.
+      observation: Observation from the commanded view; ignored if `motion` is not found, because the arm stays then.
+      motion: the Motion to that view.
+      config: threshold, rewards and episode length.
+    """
+    episode = episode_of(state)
+    is_reachable = motion.is_found
+    observation = tree_where(is_reachable, observation, episode.observation)
+    similarity = cosine_similarity(observation.code, episode.target.code)
+    is_found = is_reachable & (similarity >= config.threshold)
+    reward = jnp.where(is_found, config.success_reward, similarity - 1.0)
+    reward = jnp.where(is_reachable, reward, config.unreachable_reward)
+    num_steps = episode.num_steps + 1
+    terminated = is_found.astype(jnp.float32)
+    truncated = (num_steps >= config.episode_length) & ~is_found
+    episode = EpisodeState(observation=observation, target=episode.target, num_steps=num_steps)
+    reached = is_reachable.astype(jnp.float32)
+    flags = {"terminated": terminated, "truncated": truncated.astype(jnp.float32), "is_reachable": reached}
+    info = state.info | flags
+    costs = {"joint_travel": motion.travel, "motion_time": motion.duration}
+    metrics = state.metrics | {"similarity": similarity, "unreachable": 1.0 - reached} | costs
+    return dataclasses.replace(
+        state,
+        pipeline_state=_as_pipeline_state(episode),
+        obs=build_obs(episode),
+        reward=reward,
+        done=terminated,
+        metrics=metrics,
+        info=info,
+    )
+
+
+def commanded_view(view: View, action: Array, action_scale_deg: float) -> View:
+    """Returns the View to which an action leads, reachable or not.
+
+    Args:
+      view: the present View, f32[] rad.
+      action: f32[2], change of azimuth and elevation; clipped to [-1, 1].
+      action_scale_deg: change in degrees for an action of 1.
+    """
+    delta = jnp.clip(action, -1.0, 1.0) * math.radians(action_scale_deg)
+    return View(wrap_angle(view.azimuth + delta[0]), view.elevation + delta[1])
+
+
 def pose_error(camera: Camera, target: Camera) -> tuple[Array, Array, Array]:
-    """Returns rotation error in rad, formula 3.2 of the thesis in rad, and translation error in m."""
+    """Computes how far a camera is from the target camera.
+
+    Args:
+      camera: the Camera; its arrays may have leading batch axes.
+      target: the target Camera.
+
+    Returns:
+      Rotation error in rad (geodesic), rotation error in rad by formula 3.2 of the thesis, translation error in m.
+    """
     translation = jnp.sqrt(jnp.sum((camera.position - target.position) ** 2, axis=-1))
     rotations = (camera.rotation, target.rotation)
     return rotation_error(*rotations), frobenius_angle(*rotations), translation
+
+
+def _as_pipeline_state(episode: EpisodeState) -> base.State:
+    # brax declares its own physics state here, but never reads it and accepts any pytree.
+    return cast(base.State, episode)
