@@ -1,4 +1,4 @@
-"""Presets, validation messages and the JSON round trip."""
+"""Presets, validation messages, and the way to JSON and back."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from vsearch_jax.config import PRESETS, Config, ConfigError, EncoderConfig, Eval
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_survives_json_and_hashes(name):
+def test_a_preset_is_equal_after_json_and_has_an_equal_hash(name):
     config = Config.preset(name)
-    again = Config.from_dict(json.loads(json.dumps(config.to_dict())))
-    assert again == config
-    assert hash(again) == hash(config)
+    restored = Config.from_dict(json.loads(json.dumps(config.to_dict())))
+    assert restored == config
+    assert hash(restored) == hash(config)
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -40,19 +40,19 @@ def test_presets_keep_the_task_of_the_thesis(name):
         (lambda: dataclasses.replace(Config.preset("smoke"), num_chunks=0), "Config.num_chunks", "from 1 to"),
     ],
 )
-def test_a_value_out_of_range_is_named(build, field, value):
+def test_the_error_names_field_and_value_out_of_range(build, field, value):
     with pytest.raises(ConfigError) as error:
         build()
     assert field in str(error.value)
     assert value in str(error.value)
 
 
-def test_an_unknown_preset_is_named_with_those_that_exist():
+def test_the_error_names_the_unknown_preset_and_all_presets():
     with pytest.raises(ConfigError, match=r"unknown preset 'big'; allowed: smoke, cpu, thesis, gpu"):
         Config.preset("big")
 
 
-def test_fields_that_do_not_fit_are_named():
+def test_the_error_names_unknown_and_missing_fields():
     values = Config.preset("smoke").to_dict()
     values["encoder"]["colour"] = 1
     del values["encoder"]["channels"]
@@ -71,7 +71,7 @@ def test_fields_that_do_not_fit_are_named():
         ("sac", "num_seeds", True),
     ],
 )
-def test_a_value_of_another_type_is_named(part, field, value):
+def test_the_error_names_field_and_value_of_the_wrong_type(part, field, value):
     values = Config.preset("smoke").to_dict()
     values[part][field] = value
     with pytest.raises(ConfigError, match=rf"Config\.{field} is .*; allowed: "):
@@ -82,7 +82,7 @@ def test_a_value_of_another_type_is_named(part, field, value):
 
 
 @pytest.mark.parametrize("name", ["cpu", "thesis", "gpu"])
-def test_chunks_of_a_preset_hold_one_stage(name):
+def test_each_chunk_of_a_preset_belongs_to_one_stage(name):
     config = Config.preset(name)
     assert config.chunk_length * config.num_chunks == config.num_iterations
     assert config.encoder.num_updates % config.chunk_length == 0

@@ -1,3 +1,6 @@
+"""CMA-ES against problems with a known optimum, and its strategy against pycma."""
+
+import dataclasses
 import functools
 import math
 
@@ -17,18 +20,18 @@ CONFIG = CMAESConfig(sigma_deg=60.0)
 
 
 @functools.partial(jax.jit, static_argnames=("score_fn", "config"))
-def run(keys, args, score_fn, config) -> SearchResult:
+def run_searches(keys, args, score_fn, config) -> SearchResult:
     return jax.vmap(lambda key, args: cma_es.search(key, score_fn, args, config))(keys, args)
 
 
-NUM = 240  # one number for all, so that one compilation serves several tests
+NUM = 240  # equal in all tests, so that they share compilations
 KEYS = jax.random.split(jax.random.key(0), NUM)
-START, TARGET = (probes.random_views(jax.random.key(seed), NUM) for seed in (1, 2))
+INITIAL, TARGET = (probes.random_views(jax.random.key(seed), NUM) for seed in (1, 2))
 
 
 @pytest.fixture(scope="module")
 def result() -> SearchResult:
-    return run(KEYS, probes.search_problems(START, TARGET), probes.unreachable_outside_band, CONFIG)
+    return run_searches(KEYS, probes.search_problems(INITIAL, TARGET), probes.unreachable_outside_band, CONFIG)
 
 
 def test_finds_the_target_past_a_false_optimum_within_60_images(result):
@@ -43,33 +46,34 @@ def test_every_sample_lies_inside_the_band(result):
     assert int(result.unreachable.sum()) == 0
 
 
-def test_azimuth_is_periodic():
-    """Across the cut at 180 degrees the search is as short as anywhere else."""
+def test_a_search_across_the_azimuth_of_180_degrees_takes_as_many_images_as_elsewhere():
     elevation = jnp.full((NUM,), 1.0)
     means = []
     for azimuth in (0.0, math.pi):
-        start = View(jnp.full((NUM,), azimuth - 0.4), elevation)
+        initial = View(jnp.full((NUM,), azimuth - 0.4), elevation)
         target = View(jnp.full((NUM,), -math.pi + 0.4 if azimuth else 0.4), elevation)
-        problems = probes.search_problems(start, target)
-        means.append(np.asarray(run(KEYS, problems, probes.unreachable_outside_band, CONFIG).evaluations).mean())
+        problems = probes.search_problems(initial, target)
+        means.append(
+            np.asarray(run_searches(KEYS, problems, probes.unreachable_outside_band, CONFIG).evaluations).mean()
+        )
     assert means[1] == pytest.approx(means[0], rel=0.25)
 
 
-def test_a_start_at_the_target_costs_one_image():
-    result = run(KEYS, probes.search_problems(TARGET, TARGET), probes.unreachable_outside_band, CONFIG)
+def test_a_search_that_starts_at_the_target_takes_one_image():
+    result = run_searches(KEYS, probes.search_problems(TARGET, TARGET), probes.unreachable_outside_band, CONFIG)
     np.testing.assert_array_equal(result.evaluations, np.ones(NUM))
 
 
-def test_restarts_lead_out_of_the_false_optimum():
-    start = probes.opposite(TARGET)
+def test_restarts_leave_the_false_optimum():
+    initial = probes.opposite(TARGET)
     narrow = CMAESConfig(sigma_deg=20.0, max_generations=60)
-    result = run(KEYS, probes.search_problems(start, TARGET), probes.unreachable_outside_band, narrow)
+    result = run_searches(KEYS, probes.search_problems(initial, TARGET), probes.unreachable_outside_band, narrow)
     assert (np.asarray(result.score) >= probes.THRESHOLD).mean() >= 0.98
 
 
-def test_where_nothing_is_reachable_the_search_goes_on_and_stays_finite():
+def test_the_search_uses_all_generations_and_stays_finite_if_nothing_is_reachable():
     config = CMAESConfig(max_generations=12)
-    result = run(KEYS, probes.search_problems(START, TARGET), probes.never_reachable, config)
+    result = run_searches(KEYS, probes.search_problems(INITIAL, TARGET), probes.never_reachable, config)
     np.testing.assert_array_equal(result.evaluations, np.full(NUM, 121))
     np.testing.assert_array_equal(result.unreachable, np.full(NUM, 121))
     assert np.isfinite(np.asarray(result.view.azimuth)).all()
@@ -77,10 +81,11 @@ def test_where_nothing_is_reachable_the_search_goes_on_and_stays_finite():
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_strategy_equals_pycma(seed):
-    """Same samples and parameters in, same distribution out, over 15 generations.
+    """Equal samples and parameters give equal distributions over 15 generations.
 
-    pycma's own parameters are used on both sides, since evosax has those of the tutorial of 2016 (cmu 0.155 for 0.181,
-    cs 0.508 for 0.5). pycma starts from a covariance that is 1e-4 off the identity, which is handed over too.
+    Both sides use the parameters of pycma, because evosax has those of the tutorial of 2016: c_mu is 0.155 instead of
+    0.181, c_sigma 0.508 instead of 0.5. The initial covariance of pycma differs from the identity by 1e-4. Both sides
+    start with it.
     """
     sigma = 0.5
     oracle = cma.CMAEvolutionStrategy([0.0, 0.0], sigma, {"popsize": 10, "verbose": -9, "seed": seed})
@@ -88,7 +93,8 @@ def test_the_strategy_equals_pycma(seed):
     step_size = oracle.adapt_sigma
     with cma_es._evosax_promotion():
         params = algorithm.default_params
-    params = params.replace(
+    params = dataclasses.replace(
+        params,
         std_init=jnp.float32(sigma),
         weights=jnp.asarray(np.array(oracle.sp.weights), jnp.float32),
         c_1=oracle.sp.c1,
@@ -98,14 +104,14 @@ def test_the_strategy_equals_pycma(seed):
         d_std=step_size.damps,
         chi_n=math.sqrt(math.pi / 2.0),
     )
-    state = cma_es._start(algorithm, params, jnp.zeros(2))
-    state = state.replace(C=jnp.asarray(oracle.sm.C, jnp.float32))
+    state = cma_es._init_strategy(cma_es._Algorithm(algorithm, params), jnp.zeros(2))
+    state = dataclasses.replace(state, C=jnp.asarray(oracle.sm.C, jnp.float32))
     key = jax.random.key(0)
     for _ in range(15):
         population = np.array(oracle.ask())
         fitness = [(x[0] - 1.0) ** 2 + 6.0 * (x[1] + 0.5) ** 2 for x in population]
         with cma_es._evosax_promotion():
-            _, state = algorithm.ask(key, state, params)  # for the eigenvectors only
+            _, state = algorithm.ask(key, state, params)  # `ask` updates the eigenvectors
             state, _ = algorithm.tell(
                 key, jnp.asarray(population, jnp.float32), jnp.asarray(fitness, jnp.float32), state, params
             )

@@ -1,15 +1,12 @@
-"""Frozen, hashable, validated configuration: jit's static argument, the command line and `config.json` in one."""
+"""Configuration of a run as frozen, hashable and validated dataclasses.
+
+A `Config` is the static argument of `jax.jit`, the source of the command-line options, and the content of
+`config.json`.
+"""
 
 from vsearch_jax.config.motion import IKConfig, PlanningConfig
-from vsearch_jax.config.parts import (
-    CMAESConfig,
-    EncoderConfig,
-    EnvConfig,
-    EvaluationConfig,
-    RandomSearchConfig,
-    SACConfig,
-    SceneConfig,
-)
+from vsearch_jax.config.parts import EncoderConfig, EnvConfig, EvaluationConfig, SceneConfig
+from vsearch_jax.config.searchers import CMAESConfig, RandomSearchConfig, SACConfig
 from vsearch_jax.config.validation import ConfigError
 from vsearch_jax.config.whole import PRESETS, Config
 

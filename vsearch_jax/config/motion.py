@@ -1,4 +1,4 @@
-"""Configuration of what moves the arm: inverse kinematics and planning."""
+"""Configuration of the arm's motion: inverse kinematics and planning."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from vsearch_jax.config.validation import require, require_positive
 
 @dataclass(frozen=True)
 class IKConfig:
-    """Levenberg-Marquardt inverse kinematics and the reachability map that feeds it starts."""
+    """Inverse kinematics by Levenberg-Marquardt, and the reachability map that supplies start configurations."""
 
     num_seeds: int = 16
-    """Starts of `ik`: the present joints and others spread over the limits."""
+    """Number of start configurations of `ik`: the present joints, and others spread over the joint limits."""
     num_iterations: int = 16
-    """Iterations from each start."""
+    """Number of iterations from each start."""
     num_nullspace_steps: int = 6
-    """Steps of `ik` along the redundancy, towards the present joints and away from the limits."""
+    """Number of steps along the arm's redundancy. They lead towards the present joints and away from the limits."""
     is_roll_free: bool = False
     """Whether the camera may turn about its optical axis."""
     damping: float = 1e-3
     """Initial damping of the normal equations."""
     position_tolerance: float = 1e-3
-    """Converged below this error in m."""
+    """Largest position error of a solution, in m."""
     rotation_tolerance_deg: float = 0.1
-    """Converged below this error in degrees."""
+    """Largest rotation error of a solution, in degrees."""
     map_azimuths: int = 72
-    """Cells of the reachability map around the object."""
+    """Number of cells of the reachability map around the object."""
     map_elevations: int = 19
-    """Cells of the reachability map from the table plane to the pole."""
+    """Number of cells of the reachability map from the table plane to the pole."""
     map_seeds: int = 24
-    """Random starts for each cell of the map."""
+    """Number of random start configurations for each cell of the map."""
     map_iterations: int = 40
-    """Iterations from each start of the map."""
+    """Number of iterations from each start of the map."""
 
     def __post_init__(self) -> None:
         require_positive(
@@ -61,21 +61,21 @@ class PlanningConfig:
     """Collision-free joint paths and their timing."""
 
     num_nodes: int = 512
-    """Nodes of a tree, at most."""
+    """Maximum number of nodes in a tree."""
     max_iterations: int = 4096
-    """Edges that are tried for one problem, at most."""
+    """Maximum number of edges that are tried for one problem."""
     step: float = 3.0
-    """Length in rad of a tree's random edges."""
+    """Length of a tree's random edges, in rad."""
     resolution: float = 0.004
-    """How near in m the arm may come before an edge that leads nearer is given up; see `planning.edge_is_free`."""
+    """Smallest gap to an obstacle, in m. An edge that leads closer is rejected. See `planning.edge_is_free`."""
     num_shortcuts: int = 64
-    """Attempts to shorten a path."""
+    """Number of attempts to shorten a path."""
     max_waypoints: int = 48
-    """Configurations of a path, at most."""
+    """Maximum number of configurations in a path."""
     acceleration_time: float = 0.5
-    """Seconds in which a joint can come to its full speed: what limits its acceleration."""
+    """Time in which a joint reaches its full speed, in s. It limits the joint's acceleration."""
     settling_time: float = 0.6
-    """Seconds that a dynamic arm is given at the end of a motion."""
+    """Time at the end of a motion in which a dynamic arm comes to rest, in s."""
 
     def __post_init__(self) -> None:
         require_positive(self, "num_nodes", "max_iterations", "step", "acceleration_time")

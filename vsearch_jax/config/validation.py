@@ -1,4 +1,4 @@
-"""Checks of fields, with messages that name field, value and range."""
+"""Checks of a config's fields."""
 
 from __future__ import annotations
 
@@ -6,29 +6,63 @@ import math
 
 
 class ConfigError(ValueError):
-    """A field of the config is out of its range; the message names field, value and range."""
+    """A setting is wrong. The message names the setting, its value and the allowed values."""
 
 
 def require(owner: object, name: str, is_valid: bool, allowed: str) -> None:
-    """Raises ConfigError where field `name` of `owner` is not valid; `allowed` says what would be."""
+    """Checks one field.
+
+    Args:
+      owner: the dataclass that holds the field.
+      name: name of the field.
+      is_valid: whether the field's value is allowed.
+      allowed: the allowed values in words, for the message.
+
+    Raises:
+      ConfigError: `is_valid` is false.
+    """
     if not is_valid:
         value = getattr(owner, name)
         raise ConfigError(f"{type(owner).__name__}.{name} is {value!r}; allowed: {allowed}")
 
 
 def require_positive(owner: object, *names: str) -> None:
-    """Raises ConfigError where one of the fields `names` of `owner` is not above 0."""
+    """Checks that fields are greater than 0 and finite.
+
+    Args:
+      owner: the dataclass that holds the fields.
+      *names: names of the fields.
+
+    Raises:
+      ConfigError: a field is 0, negative, infinite or NaN.
+    """
     for name in names:
         require(owner, name, 0 < getattr(owner, name) < math.inf, "greater than 0, finite")
 
 
 def require_finite(owner: object, *names: str) -> None:
-    """Raises ConfigError where one of the fields `names` of `owner` is not a finite number."""
+    """Checks that fields are finite numbers.
+
+    Args:
+      owner: the dataclass that holds the fields.
+      *names: names of the fields.
+
+    Raises:
+      ConfigError: a field is infinite or NaN.
+    """
     for name in names:
         require(owner, name, math.isfinite(getattr(owner, name)), "finite")
 
 
 def require_unit(owner: object, *names: str) -> None:
-    """Raises ConfigError where one of the fields `names` of `owner` is not from 0 to 1."""
+    """Checks that fields lie between 0 and 1, both included.
+
+    Args:
+      owner: the dataclass that holds the fields.
+      *names: names of the fields.
+
+    Raises:
+      ConfigError: a field is below 0, above 1 or NaN.
+    """
     for name in names:
         require(owner, name, 0.0 <= getattr(owner, name) <= 1.0, "from 0 to 1")

@@ -1,27 +1,21 @@
-"""A whole run's config and the presets; these differ in size only, not in the task."""
+"""Configuration of a whole run, and the presets. The presets differ in size, not in the task."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vsearch_jax.config.motion import IKConfig, PlanningConfig
-from vsearch_jax.config.parts import (
-    CMAESConfig,
-    EncoderConfig,
-    EnvConfig,
-    EvaluationConfig,
-    RandomSearchConfig,
-    SACConfig,
-    SceneConfig,
-)
+from vsearch_jax.config.parsing import parse_dataclass
+from vsearch_jax.config.parts import EncoderConfig, EnvConfig, EvaluationConfig, SceneConfig
+from vsearch_jax.config.searchers import CMAESConfig, RandomSearchConfig, SACConfig
 from vsearch_jax.config.validation import ConfigError, require
 
 
 @dataclass(frozen=True)
 class Config:
-    """A whole run."""
+    """Configuration of a whole run."""
 
     scene: SceneConfig = field(default_factory=SceneConfig)
     ik: IKConfig = field(default_factory=IKConfig)
@@ -33,32 +27,32 @@ class Config:
     sac: SACConfig = field(default_factory=SACConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     num_chunks: int = 1
-    """Equal parts into which a run is cut: a call of `train` does one. The last is shorter where they don't divide."""
+    """Number of equal chunks of a run. Each call of `train` runs one chunk. The last chunk may be shorter."""
 
     def __post_init__(self) -> None:
         reduction = self.encoder.stem_stride * 2 ** (len(self.encoder.channels) - 1)
-        allowed = f"a multiple of {reduction}, by which the encoder's convolutions divide it"
+        allowed = f"a multiple of {reduction} (the encoder's convolutions divide the size by it)"
         require(self.scene, "image_size", self.scene.image_size % reduction == 0, allowed)
         require(
             self,
             "num_chunks",
             0 < self.num_chunks <= self.num_iterations,
-            f"from 1 to {self.num_iterations} iterations",
+            f"from 1 to the run's number of iterations ({self.num_iterations})",
         )
 
     @property
     def num_policy_iterations(self) -> int:
-        """Policy iterations: each steps every environment once."""
+        """Number of policy iterations. Each one steps every environment once."""
         return self.sac.num_environment_steps // self.sac.num_envs
 
     @property
     def num_iterations(self) -> int:
-        """Iterations of the run: encoder updates, then policy iterations."""
+        """Number of iterations of the run: encoder updates, then policy iterations."""
         return self.encoder.num_updates + self.num_policy_iterations
 
     @property
     def chunk_length(self) -> int:
-        """Iterations of a chunk."""
+        """Number of iterations in a chunk, the last one excepted."""
         return -(-self.num_iterations // self.num_chunks)
 
     @staticmethod
@@ -72,50 +66,18 @@ class Config:
             raise ConfigError(f"unknown preset {name!r}; allowed: {', '.join(PRESETS)}")
         return PRESETS[name]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Returns nested plain values, fit for JSON."""
+    def to_dict(self) -> dict[str, object]:
+        """Returns the config as nested plain values, which `json.dumps` accepts."""
         return dataclasses.asdict(self)
 
     @staticmethod
-    def from_dict(values: dict[str, Any]) -> Config:
-        """Returns the config that `to_dict` wrote.
+    def from_dict(values: Mapping[str, object]) -> Config:
+        """Returns the config that `to_dict` turned into `values`.
 
         Raises:
-          ConfigError: a field is unknown or missing, or its value is of another type or out of range.
+          ConfigError: a field is unknown or missing, or its value has another type or is out of range.
         """
-        return _from_dict(Config, values)
-
-
-def _from_dict(cls: type, values: dict[str, Any]) -> Any:
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    unknown, missing = sorted(set(values) - set(fields)), sorted(set(fields) - set(values))
-    if unknown or missing:
-        raise ConfigError(
-            f"{cls.__name__}: unknown fields {unknown}, missing fields {missing}; expected {sorted(fields)}"
-        )
-    arguments = {}
-    for name, hint in get_type_hints(cls).items():
-        value = tuple(values[name]) if isinstance(values[name], list) else values[name]
-        if dataclasses.is_dataclass(hint) and isinstance(value, dict):
-            value = _from_dict(hint, value)  # pyright: ignore[reportArgumentType] # a hint that is a dataclass is a type
-        elif not _fits(value, hint):
-            allowed = str(hint).replace("typing.", "") if get_args(hint) else getattr(hint, "__name__", hint)
-            raise ConfigError(f"{cls.__name__}.{name} is {value!r}; allowed: {allowed}")
-        arguments[name] = value
-    return cls(**arguments)
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Returns whether `value` is of the type `hint`, one of those that fields of a config have."""
-    arguments = get_args(hint)
-    if get_origin(hint) is Literal:
-        return value in arguments
-    if get_origin(hint) is tuple:
-        return isinstance(value, tuple) and all(_fits(entry, arguments[0]) for entry in value)
-    if arguments:
-        return any(_fits(value, argument) for argument in arguments)
-    kinds = (int, float) if hint is float else hint
-    return isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
+        return parse_dataclass(Config, values)
 
 
 PRESETS: dict[str, Config] = {

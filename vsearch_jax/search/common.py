@@ -1,10 +1,10 @@
-"""What the black-box searchers share: the problem, the record of what was seen, and the fold into the band."""
+"""Parts of the black-box searchers: the search problem, the record of the evaluations, and the loop of a search."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import flax.struct
 import jax
@@ -14,39 +14,43 @@ from jax import Array
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.types import SearchResult, View
 
-ScoreFn = Callable[[View, Any], Array]
-"""`score_fn(view, task) -> f32[]`: cosine similarity to the target at `view`, -inf where the arm cannot reach it."""
+Task = TypeVar("Task")
+Task_co = TypeVar("Task_co", covariant=True)
+SearchState = TypeVar("SearchState")
+
+ScoreFn = Callable[[View, Task], Array]
+"""`score_fn(view, task) -> f32[]`: cosine similarity to the target at `view`, or -inf where the arm cannot reach it."""
 
 
 @flax.struct.dataclass
-class SearchArgs:
-    """One search problem; everything in it may be batched with `jax.vmap`.
+class SearchArgs(Generic[Task_co]):
+    """One search problem. Every field may be batched by `jax.vmap`.
 
     Attributes:
-      initial: View of f32[] rad, where the arm starts; its image is the first evaluation.
-      band: f32[2] rad, lowest and highest elevation to search.
-      threshold: f32[], the score at which the search ends.
-      task: any pytree, handed to `score_fn` untouched: the scene, encoder and target code, for instance.
+      initial: View of f32[] rad, where the search starts. Its image is the first evaluation.
+      band: f32[2] rad, lowest and highest elevation of the search.
+      threshold: f32[], score at which the search ends.
+      task: any pytree, for instance the target code. The searcher only passes it to `score_fn`.
     """
 
     initial: View
     band: Array
     threshold: Array
-    task: Any
+    task: Task_co
 
 
 @flax.struct.dataclass
 class Record:
-    """What a search has seen so far; G is the most generations.
+    """What a search has found so far; G is the maximum number of generations.
 
     Attributes:
-      view: View of f32[] rad, the best view seen; the initial view while nothing better was seen.
-      score: f32[], its score.
-      best_scores: f32[G], best score after each generation, the present one repeated to the end.
-      evaluations: i32[], images taken.
-      unreachable: i32[], how many of them the arm could not reach.
-      generation: i32[], generations done.
-      best: i32[], which of the last generation's views it is; -1 if none of them.
+      view: View of f32[] rad, the best view; the initial view if no other is better.
+      score: f32[], score of `view`.
+      best_scores: f32[G], best score after each generation; the present best score fills the rest.
+      evaluations: i32[], number of images taken.
+      unreachable: i32[], number of those images' views that the arm could not reach.
+      generation: i32[], number of generations done.
+      best: i32[], index of `view` in the last generation; -1 if `view` is older.
     """
 
     view: View
@@ -58,41 +62,58 @@ class Record:
     best: Array
 
 
-class Method(NamedTuple):
-    """A black-box searcher in parts, for callers that take the images of several searchers in one place.
+class Method(NamedTuple, Generic[SearchState]):
+    """A black-box searcher in parts, for callers that take the images themselves. N is `num_views`.
 
     Attributes:
-      start: (args, score of the initial view f32[]) -> state, any pytree.
-      ask: (key, args, state) -> the next generation, View of f32[num_views] rad, and the state that waits for it. The
-        key is the search's, the same in every generation.
-      tell: (key, args, state, views, scores f32[num_views]) -> state.
+      start: (args, score of the initial view f32[]) -> state, a pytree.
+      ask: (key, args, state) -> (views, state). `views` is the next generation, View of f32[N] rad. `key` is the key of
+        the whole search; it is equal in every generation.
+      tell: (key, args, state, views, scores f32[N]) -> state. `state` is the state that `ask` returned.
       record: state -> Record.
-      num_views: views of a generation.
+      num_views: number of views in a generation.
     """
 
-    start: Callable[[SearchArgs, Array], Any]
-    ask: Callable[[Array, SearchArgs, Any], tuple[View, Any]]
-    tell: Callable[[Array, SearchArgs, Any, View, Array], Any]
-    record: Callable[[Any], Record]
+    start: Callable[[SearchArgs[object], Array], SearchState]
+    ask: Callable[[Array, SearchArgs[object], SearchState], tuple[View, SearchState]]
+    tell: Callable[[Array, SearchArgs[object], SearchState, View, Array], SearchState]
+    record: Callable[[SearchState], Record]
     num_views: int
 
 
-def run_search(key: Array, score_fn: ScoreFn, args: SearchArgs, method: Method) -> SearchResult:
-    """Returns what `method` finds; `score_fn` is vmapped over the views of a generation."""
+def run_search(
+    key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], method: Method[SearchState]
+) -> SearchResult:
+    """Runs a search until its score meets the threshold or its generations are used up.
+
+    Args:
+      key: PRNG key.
+      score_fn: maps (view, args.task) to the score f32[]. `jax.vmap` is applied to it over a generation's views.
+      args: SearchArgs of one problem.
+      method: the searcher.
+    """
     state = method.start(args, score_fn(args.initial, args.task))
-    body = functools.partial(_generation, key, score_fn, args, method)
+    body = functools.partial(_run_generation, key, score_fn, args, method)
     state = jax.lax.while_loop(lambda state: is_running(method.record(state), args.threshold), body, state)
     return to_result(method.record(state))
 
 
-def _generation(key: Array, score_fn: ScoreFn, args: SearchArgs, method: Method, state: Any) -> Any:
+def _run_generation(
+    key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], method: Method[SearchState], state: SearchState
+) -> SearchState:
     views, state = method.ask(key, args, state)
     scores = jax.vmap(score_fn, in_axes=(0, None))(views, args.task)
     return method.tell(key, args, state, views, scores)
 
 
 def start_record(view: View, score: Array, max_generations: int) -> Record:
-    """Returns the record after the image of the initial `view` (View of f32[] rad), whose score is `score` (f32[])."""
+    """Returns the record after the image of the initial view.
+
+    Args:
+      view: the initial View of f32[] rad.
+      score: f32[], its score; -inf if the arm cannot reach it.
+      max_generations: number of generations after which the search gives up.
+    """
     return Record(
         view=view,
         score=score,
@@ -105,16 +126,33 @@ def start_record(view: View, score: Array, max_generations: int) -> Record:
 
 
 def taken_images(scores: Array, threshold: Array) -> Array:
-    """Returns bool[N], which of a generation's images are taken: none after the first whose score meets `threshold`."""
+    """Marks the images of a generation that are taken: all up to the first whose score meets the threshold.
+
+    Args:
+      scores: f32[N], scores of the views in the order in which their images are taken.
+      threshold: f32[], score at which the search ends.
+
+    Returns:
+      bool[N].
+    """
     is_hit = (scores >= threshold).astype(jnp.int32)
     return jnp.cumsum(is_hit) - is_hit == 0
 
 
 def add_generation(record: Record, views: View, scores: Array, threshold: Array) -> Record:
-    """Returns `record` with one more generation of `views` (View of f32[N] rad) and their `scores` (f32[N]).
+    """Adds one generation to the record.
 
-    The images are taken one by one and the search ends with the first that meets `threshold` (f32[]); those after it
-    are not taken, so they neither count nor enter the best.
+    The images are taken one by one. The search ends with the first image that meets the threshold. The images after it
+    are not taken: they are not counted and cannot become the best.
+
+    Args:
+      record: Record before the generation.
+      views: View of f32[N] rad.
+      scores: f32[N], scores of `views`; -inf where the arm cannot reach the view.
+      threshold: f32[], score at which the search ends.
+
+    Returns:
+      Record after the generation.
     """
     is_taken = taken_images(scores, threshold)
     taken_scores = jnp.where(is_taken, scores, -jnp.inf)
@@ -136,12 +174,20 @@ def add_generation(record: Record, views: View, scores: Array, threshold: Array)
 
 
 def is_running(record: Record, threshold: Array) -> Array:
-    """Returns bool[]: the threshold (f32[]) is not met and generations are left."""
+    """Checks whether a search goes on: its score is below the threshold and it has generations left.
+
+    Args:
+      record: Record of the search.
+      threshold: f32[], score at which the search ends.
+
+    Returns:
+      bool[].
+    """
     return (record.score < threshold) & (record.generation < record.best_scores.shape[0])
 
 
 def to_result(record: Record) -> SearchResult:
-    """Returns the SearchResult of a finished search; its azimuth is in [-pi, pi)."""
+    """Returns the SearchResult of a finished search. Its azimuth lies in [-pi, pi)."""
     return SearchResult(
         view=View(azimuth=wrap_angle(record.view.azimuth), elevation=record.view.elevation),
         score=record.score,
@@ -152,10 +198,16 @@ def to_result(record: Record) -> SearchResult:
 
 
 def fold_into_band(elevation: Array, band: Array) -> Array:
-    """Returns `elevation` (rad, any shape) reflected at the ends of `band` (f32[2] rad) until it lies inside.
+    """Reflects an elevation at the ends of the band until it lies inside.
 
-    Reflection keeps the density of the samples smooth, where clipping would heap them on the band's edges. A band of no
-    width gives its one elevation.
+    Reflection keeps the density of random samples smooth. Clipping would put many samples on the ends of the band.
+
+    Args:
+      elevation: f32[...] rad.
+      band: f32[2] rad, lowest and highest elevation. A band of zero width gives its one elevation.
+
+    Returns:
+      f32[...] rad, inside the band.
     """
     width = band[1] - band[0]
     period = jnp.where(width > 0.0, 2.0 * width, 1.0)

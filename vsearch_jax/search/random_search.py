@@ -15,6 +15,7 @@ from vsearch_jax.search.common import (
     Record,
     ScoreFn,
     SearchArgs,
+    Task,
     add_generation,
     fold_into_band,
     run_search,
@@ -23,16 +24,18 @@ from vsearch_jax.search.common import (
 from vsearch_jax.types import SearchResult, View
 
 
-def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearchConfig) -> SearchResult:
-    """Searches the view sphere by normal samples around the best view, wider the worse its score.
+def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: RandomSearchConfig) -> SearchResult:
+    """Searches the view sphere with normal samples around the best view so far.
 
-    The standard deviation of azimuth and elevation is k (1 - c) rad, c the best score so far (-1 at the least). Azimuth
-    wraps; an elevation outside the band is reflected into it. The search ends at the threshold or after
-    `config.max_epochs`; if the initial view meets the threshold, after its one image.
+    The standard deviation of azimuth and elevation is k (1 - c) rad. Here c is the best score so far, at least -1. So
+    the samples spread further where the score is worse. Azimuth wraps. An elevation outside the band is reflected into
+    the band. The search ends at the threshold or after `config.max_epochs`. If the initial view meets the threshold,
+    the search takes one image only.
 
     Args:
       key: PRNG key.
-      score_fn: maps (view, args.task) to the score, f32[]; -inf where unreachable. It is vmapped over the samples.
+      score_fn: maps (view, args.task) to the score f32[], -inf where the arm cannot reach the view. `jax.vmap` is
+        applied to it over the samples of an epoch.
       args: SearchArgs of one problem.
       config: RandomSearchConfig.
 
@@ -42,20 +45,22 @@ def search(key: Array, score_fn: ScoreFn, args: SearchArgs, config: RandomSearch
     return run_search(key, score_fn, args, method(config))
 
 
-def method(config: RandomSearchConfig) -> Method:
-    """Returns the searcher's parts; its state is the record."""
+def method(config: RandomSearchConfig) -> Method[Record]:
+    """Returns the searcher in parts. Its state is the record."""
     return Method(
         start=lambda args, score: start_record(args.initial, score, config.max_epochs),
-        ask=functools.partial(_ask, config),
+        ask=functools.partial(_sample_views, config),
         tell=lambda key, args, record, views, scores: add_generation(record, views, scores, args.threshold),
         record=lambda record: record,
         num_views=config.num_samples,
     )
 
 
-def _ask(config: RandomSearchConfig, key: Array, args: SearchArgs, record: Record) -> tuple[View, Record]:
+def _sample_views(
+    config: RandomSearchConfig, key: Array, args: SearchArgs[object], record: Record
+) -> tuple[View, Record]:
     noise = jax.random.normal(jax.random.fold_in(key, record.generation), (2, config.num_samples))
-    sigma = config.k * (1.0 - jnp.maximum(record.score, -1.0))  # -1 stands in for the -inf of an unreachable start
+    sigma = config.k * (1.0 - jnp.maximum(record.score, -1.0))  # an unreachable initial view has the score -inf
     views = View(
         azimuth=wrap_angle(record.view.azimuth + sigma * noise[0]),
         elevation=fold_into_band(record.view.elevation + sigma * noise[1], args.band),

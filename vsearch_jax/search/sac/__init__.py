@@ -1,4 +1,4 @@
-"""Soft actor-critic with goal relabelling: networks, update, replay and the roll-out of the policy."""
+"""Soft actor-critic with goal relabelling: networks, update, replay buffer, relabelling and the search by a policy."""
 
 from vsearch_jax.search.sac.agent import act, init, td_target, update
 from vsearch_jax.search.sac.policy import PolicyTask, search

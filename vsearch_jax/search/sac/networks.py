@@ -1,10 +1,10 @@
-"""Actor and critic of soft actor-critic as flax.nnx modules, split to pytrees of parameters."""
+"""Actor and critic of soft actor-critic as flax.nnx modules. Their parameters are kept apart, as `nnx.State`."""
 
 from __future__ import annotations
 
 import functools
 import itertools
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -13,49 +13,90 @@ from jax import Array
 
 
 class Actor(nnx.Module):
-    """Observation to the parameters of a tanh-normal distribution over actions."""
+    """Maps an obs to the parameters of a tanh-normal distribution over actions."""
 
     def __init__(self, sizes: tuple[int, ...], rngs: nnx.Rngs) -> None:
-        """Makes layers of `sizes`, input and output included."""
+        """Creates random layers.
+
+        Args:
+          sizes: number of units of each layer, from the input to the output.
+          rngs: random streams of flax.
+        """
         self.layers = nnx.List([nnx.Linear(i, o, rngs=rngs) for i, o in itertools.pairwise(sizes)])
 
-    def __call__(self, observation: Array) -> Array:
-        """Returns f32[..., sizes[-1]]: means, then what softplus turns into standard deviations."""
+    def __call__(self, obs: Array) -> Array:
+        """Returns f32[..., sizes[-1]]: the means, then the inputs of softplus, which gives the standard deviations."""
         *hidden_layers, last_layer = self.layers
-        hidden = observation
+        hidden = obs
         for layer in hidden_layers:
             hidden = nnx.relu(layer(hidden))
         return last_layer(hidden)
 
 
 class Critic(nnx.Module):
-    """Observation and action to one value, with layer norm before each activation."""
+    """Maps an obs and an action to one value. Layer norm precedes each activation."""
 
     def __init__(self, sizes: tuple[int, ...], rngs: nnx.Rngs) -> None:
-        """Makes layers of `sizes`, input and output included."""
+        """Creates random layers.
+
+        Args:
+          sizes: number of units of each layer, from the input (obs and action) to the output.
+          rngs: random streams of flax.
+        """
         self.layers = nnx.List([nnx.Linear(i, o, rngs=rngs) for i, o in itertools.pairwise(sizes)])
         self.norms = nnx.List([nnx.LayerNorm(size, rngs=rngs) for size in sizes[1:-1]])
 
-    def __call__(self, observation: Array, action: Array) -> Array:
-        """Returns the value, f32[...]."""
+    def __call__(self, obs: Array, action: Array) -> Array:
+        """Computes the value of an action.
+
+        Args:
+          obs: f32[..., D].
+          action: f32[..., A] in [-1, 1].
+
+        Returns:
+          f32[...].
+        """
         *hidden_layers, last_layer = self.layers
-        hidden = jnp.concatenate([observation, action], axis=-1)
+        hidden = jnp.concatenate([obs, action], axis=-1)
         for layer, norm in zip(hidden_layers, self.norms, strict=True):
             hidden = nnx.relu(norm(layer(hidden)))
         return last_layer(hidden)[..., 0]
 
 
-def init_network(key: Array, network: type[nnx.Module], sizes: tuple[int, ...]) -> Any:
-    """Returns fresh parameters, a pytree, of a `network` whose layers have `sizes`."""
-    return nnx.split(network(sizes, nnx.Rngs(key)))[1]  # pyright: ignore[reportCallIssue] # Actor's and Critic's signature
+Network: TypeAlias = Actor | Critic
 
 
-def apply_network(network: type[nnx.Module], sizes: tuple[int, ...], params: Any, *inputs: Array) -> Array:
-    """Returns the output of a `network` whose layers have `sizes`, with `params`, for `inputs` of any leading axes."""
-    return nnx.merge(_graphdef(network, sizes), params)(*inputs)  # pyright: ignore[reportCallIssue] # modules are callable
+def init_network(key: Array, network: type[Network], sizes: tuple[int, ...]) -> nnx.State:
+    """Creates random parameters.
+
+    Args:
+      key: PRNG key.
+      network: Actor or Critic.
+      sizes: number of units of each layer, from the input to the output.
+
+    Returns:
+      The parameters.
+    """
+    return nnx.split(network(sizes, nnx.Rngs(key)))[1]
+
+
+def apply_network(network: type[Network], sizes: tuple[int, ...], params: nnx.State, *inputs: Array) -> Array:
+    """Evaluates a network.
+
+    Args:
+      network: Actor or Critic.
+      sizes: number of units of each layer, from the input to the output.
+      params: parameters from `init_network` with the same `network` and `sizes`.
+      *inputs: arguments of the network, f32[..., size].
+
+    Returns:
+      Output of the network, f32[..., sizes[-1]] of an Actor, f32[...] of a Critic.
+    """
+    return nnx.merge(_graphdef(network, sizes), params)(*inputs)
 
 
 @functools.cache
-def _graphdef(network: type[nnx.Module], sizes: tuple[int, ...]) -> Any:
-    abstract = nnx.eval_shape(lambda: network(sizes, nnx.Rngs(jax.random.key(0))))  # pyright: ignore[reportCallIssue]
+def _graphdef(network: type[Network], sizes: tuple[int, ...]) -> nnx.GraphDef[Network]:
+    """Returns the structure of a network without its parameters."""
+    abstract = nnx.eval_shape(lambda: network(sizes, nnx.Rngs(jax.random.key(0))))
     return nnx.split(abstract)[0]

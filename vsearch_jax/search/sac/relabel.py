@@ -14,19 +14,24 @@ from vsearch_jax.types import Transition
 def relabel(
     key: Array, transitions: Transition, candidate_codes: Array, env_config: EnvConfig, config: SACConfig
 ) -> Transition:
-    """Replaces the target of a part of the batch and recomputes what follows from it.
+    """Replaces the target of some transitions, and computes reward and `terminated` of all of them anew.
 
-    Of the fraction `config.relabel_fraction`, two thirds get a random one of `candidate_codes` and a third the code to
-    which their own step led, which makes that step a success. Reward and `terminated` of every transition are
-    recomputed from the codes; a step that the arm could not do keeps `unreachable_reward` and never terminates, as in
-    the environment, and is not relabelled with its own code: it is no way to a target.
+    A fraction `config.relabel_fraction` of the batch gets a new target. For two thirds of it, the target is a random
+    one of `candidate_codes`. For one third, the target is the code after the transition's own step, so that the step is
+    a success.
+
+    A transition whose step was unreachable gets `unreachable_reward` and does not terminate, as in the environment. It
+    never gets its own code as target, because its step leads to no target.
 
     Args:
       key: PRNG key.
-      transitions: Transition with a leading batch axis; observations are code ‖ target code ‖ joints.
+      transitions: Transition with a leading batch axis. Each obs is code, target code and joint values in one vector.
       candidate_codes: f32[N, Z], codes of reachable views.
       env_config: threshold and rewards.
       config: SACConfig.
+
+    Returns:
+      Transition with the same batch axis.
     """
     num, size = transitions.reward.shape[0], candidate_codes.shape[-1]
     choice_key, candidate_key = jax.random.split(key)
@@ -35,21 +40,21 @@ def relabel(
     next_code = transitions.next_obs[:, :size]
     is_reachable = transitions.is_reachable > 0.5
     is_own = (choice < config.relabel_fraction / 3.0) & is_reachable
-    is_other = choice < config.relabel_fraction
+    is_new = choice < config.relabel_fraction
     target = transitions.obs[:, size : 2 * size]
-    target = jnp.where(is_own[:, None], next_code, jnp.where(is_other[:, None], candidate, target))
+    target = jnp.where(is_own[:, None], next_code, jnp.where(is_new[:, None], candidate, target))
 
     similarity = cosine_similarity(next_code, target)
     is_found = is_reachable & (similarity >= env_config.threshold)
     reward = jnp.where(is_found, env_config.success_reward, similarity - 1.0)
     return transitions._replace(
-        obs=_with_target(transitions.obs, target),
-        next_obs=_with_target(transitions.next_obs, target),
+        obs=_replace_target(transitions.obs, target),
+        next_obs=_replace_target(transitions.next_obs, target),
         reward=jnp.where(is_reachable, reward, env_config.unreachable_reward),
         terminated=is_found.astype(transitions.terminated.dtype),
     )
 
 
-def _with_target(observation: Array, target: Array) -> Array:
+def _replace_target(obs: Array, target: Array) -> Array:
     size = target.shape[-1]
-    return jnp.concatenate([observation[:, :size], target, observation[:, 2 * size :]], axis=-1)
+    return jnp.concatenate([obs[:, :size], target, obs[:, 2 * size :]], axis=-1)
