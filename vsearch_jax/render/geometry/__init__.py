@@ -1,1 +1,1 @@
-"""Rays, level sets and triangles: what each pixel hits."""
+"""What each ray hits: ray functions of the primitives, their level sets, triangles and the rasteriser."""

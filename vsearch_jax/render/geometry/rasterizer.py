@@ -1,9 +1,22 @@
-"""Which triangle each pixel of a pinhole or parallel view sees: a rasteriser whose test is the exact one of a ray.
+"""A rasteriser for triangles: the nearest face of each pixel, with an exact ray–triangle test.
 
-A face that is seen covers a pixel or two, so rays that look for faces would do far more work than faces that look for
-pixels. Every face finds the rectangle of pixels around it; the pairs of face and pixel of all rectangles stand in one
-long list, of which equal parts are tested at a time; the nearest face of each pixel stays. The cost is that of a few
-simple passes over the faces plus that of the pairs, whose number the image bounds, not the mesh.
+A visible face of a mesh covers only a few pixels. So it is cheaper to find the pixels of each face than to find the
+face of each ray. The algorithm has three steps:
+
+1. `_bounding_rectangles` projects the corners of every face, and returns the rectangle of pixels that holds the face.
+   Faces outside the image and culled faces get an empty rectangle.
+2. All pairs (face, pixel of its rectangle) are numbered; see `pairs.py`. A loop takes a batch of consecutive numbers at
+   a time, and recovers from each number the face (a scatter of the faces' first numbers, then a running maximum) and
+   the pixel (the pair's rank within its face).
+3. For each pair, the ray through the pixel's centre is tested against the face. The nearest hit of each pixel is kept
+   (a depth buffer, by a scatter of minima).
+
+The test is that of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1), 2013: the corners are
+sheared so that the ray becomes the z axis, then the signs of three areas tell on which side of each edge the ray is.
+Two faces that share an edge compute the area of that edge from the same numbers, so no ray slips between them.
+
+Step 1 costs a few passes over the faces. Steps 2 and 3 cost as much as there are pairs, and that number depends on the
+image more than on the number of faces.
 """
 
 from __future__ import annotations
@@ -15,25 +28,32 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from vsearch_jax.render.geometry.pairs import Pairs, count_pairs, faces_of_pairs, pixels_of_pairs
 from vsearch_jax.render.geometry.triangles import Triangles
 from vsearch_jax.xla.materialize import materialize
 from vsearch_jax.xla.vectors import Vector
 
-# A face that reaches closer to the viewer's plane, in m, is not projected; it is tested in all pixels.
+# m. A face that comes closer than this to the plane of the viewer is not projected; it is tested in all pixels.
 _NEAR = 1e-6
-# Rounding of a projected corner, far more than it is, in pixels.
-_SLACK = 1e-3
-# Pairs of face and pixel that are tested at a time.
-_PART = 4096
-# Less than 2^31 by what a sum in f32 may be off.
-_MOST_PAIRS = 2.1e9
+# Pixels. Rectangles grow by this, which is far more than the rounding error of a projected corner.
+_MARGIN = 1e-3
+# Pairs (face, pixel) that are tested at a time.
+_BATCH = 4096
+# Largest number of pairs. It is below 2^31 by more than the rounding error of the sum in f32 that counts them.
+_MAX_PAIRS = 2.1e9
 
 
 class Pinhole(NamedTuple):
-    """How a view maps onto pixels: column = center_x + scale_x x, row = center_y - scale_y y.
+    """How a view maps onto pixels: column = center_x + scale_x * x, row = center_y - scale_y * y.
 
-    (x, y, -1) is a ray's direction in the view's frame; in a parallel view (x, y) m is where it starts. The centre of
-    the first pixel has column and row 0.
+    In a perspective view, (x, y, -1) is the direction of a ray in the view's frame. In a parallel view, (x, y) m is the
+    origin of a ray. The centre of the first pixel has column 0 and row 0.
+
+    Attributes:
+      scale_x: f32[] pixels; pixels per m in a parallel view.
+      scale_y: f32[] pixels; pixels per m in a parallel view.
+      center_x: f32[] pixels, column of the view's axis.
+      center_y: f32[] pixels, row of the view's axis.
     """
 
     scale_x: Array
@@ -47,21 +67,21 @@ class Raster(NamedTuple):
 
     Attributes:
       depth: f32[H, W] m along the view's axis, +inf on a miss.
-      face: i32[H, W]; 0 on a miss.
+      face: i32[H, W], row of the face in `Triangles`; 0 on a miss.
     """
 
     depth: Array
     face: Array
 
 
-class View(NamedTuple):
-    """Where the geoms are in a view that looks along -z, and how it maps onto pixels.
+class Projection(NamedTuple):
+    """A view of the geoms along its -z axis, and its mapping onto pixels.
 
     Attributes:
-      pose: f32[12, M], rows of the 3 x 4 matrix from the geom's frame to the view's.
-      is_culled: f32[M], 1 where faces that show their back are passed over.
+      pose: f32[12, M], row by row the 3 x 4 matrix from each geom's frame to the view's frame, in m.
+      is_culled: f32[M], 1 where back faces of the geom are left out, else 0.
       pinhole: Pinhole.
-      is_parallel: static.
+      is_parallel: True for parallel rays, False for a perspective view; static.
     """
 
     pose: Array
@@ -74,172 +94,162 @@ def _take(table: Array, index: Array) -> Array:
     return table.at[index].get(mode="promise_in_bounds")
 
 
-def _per_face(table: Array, geom: Array) -> list[Array]:
-    """Returns each row of `table` [R, M] looked up for each face's geom; a single geom's needs no looking up."""
-    return [row[0] if table.shape[1] == 1 else _take(row, geom) for row in table]
-
-
-def _corner(view: View, pose: list[Array], point: Vector) -> tuple[Array, Array, Array, Array]:
-    """Returns homogeneous x, y, w and depth of a corner in the view's frame."""
-    x, y, z = point
-    rows = [pose[i] * x + pose[i + 1] * y + pose[i + 2] * z + pose[i + 3] for i in (0, 4, 8)]
-    depth = -rows[2]
-    return rows[0], rows[1], jnp.ones_like(depth) if view.is_parallel else depth, depth
-
-
-def _least(values: list[Array]) -> Array:
+# Elementwise, and not `jnp.min` of a stack: XLA on CPU is slow on an axis of length 3.
+def _min_of_three(values: list[Array]) -> Array:
     return jnp.minimum(jnp.minimum(values[0], values[1]), values[2])
 
 
-def _most(values: list[Array]) -> Array:
+def _max_of_three(values: list[Array]) -> Array:
     return jnp.maximum(jnp.maximum(values[0], values[1]), values[2])
 
 
-def _extent(x: list[Array], w: list[Array], scale: Array, center: Array, count: int) -> Array:
-    """Returns i32[T]: the first pixel that the face may cover along one axis, and above 16 bits the one after the last.
+def _rows_of_faces(table: Array, geom: Array) -> list[Array]:
+    """Returns each row of `table` [R, M] for the geom of each face. A single geom needs no gather."""
+    return [row[0] if table.shape[1] == 1 else _take(row, geom) for row in table]
 
-    Three corners before the viewer bound the face. Of a face with a corner behind, only those are sorted out that lie
-    on the far side of an edge of the image, a test that holds for any corners.
+
+def _to_view(projection: Projection, pose: list[Array], point: Vector) -> tuple[Array, Array, Array, Array]:
+    """Returns homogeneous x, y and w of a corner in the view's frame, and its depth in m."""
+    x, y, z = point
+    rows = [pose[i] * x + pose[i + 1] * y + pose[i + 2] * z + pose[i + 3] for i in (0, 4, 8)]
+    depth = -rows[2]
+    return rows[0], rows[1], jnp.ones_like(depth) if projection.is_parallel else depth, depth
+
+
+def _pixel_interval(x: list[Array], w: list[Array], scale: Array, center: Array, count: int) -> Array:
+    """Returns i32[T], the interval of pixels along one axis that may show each face; see `Pairs` for its bits.
+
+    If all three corners are in front of the viewer, their pixels bound the face. If a corner is behind, the interval is
+    the whole axis, except for faces that lie wholly outside one edge of the image. That test holds for any corners.
+
+    Args:
+      x: f32[T] for each of three corners, homogeneous coordinate along the axis.
+      w: f32[T] for each of three corners.
+      scale: f32[] pixels.
+      center: f32[] pixels.
+      count: number of pixels along the axis.
     """
     pixel = [center + scale * a / jnp.where(b > _NEAR, b, 1.0) for a, b in zip(x, w, strict=True)]
     low_edge, high_edge = (-0.5 - center) / scale, (count - 0.5 - center) / scale
-    is_outside = _most([a - low_edge * b for a, b in zip(x, w, strict=True)]) < 0.0
-    is_outside |= _least([a - high_edge * b for a, b in zip(x, w, strict=True)]) > 0.0
-    is_outside |= _most(w) <= _NEAR
-    is_crossing = _least(w) <= _NEAR
-    first = jnp.where(is_crossing, 0.0, jnp.clip(jnp.ceil(_least(pixel) - _SLACK), 0, count))
-    stop = jnp.where(is_crossing, count, jnp.clip(jnp.floor(_most(pixel) + _SLACK) + 1.0, 0, count))
+    is_outside = _max_of_three([a - low_edge * b for a, b in zip(x, w, strict=True)]) < 0.0
+    is_outside |= _min_of_three([a - high_edge * b for a, b in zip(x, w, strict=True)]) > 0.0
+    is_outside |= _max_of_three(w) <= _NEAR
+    is_crossing = _min_of_three(w) <= _NEAR
+    first = jnp.where(is_crossing, 0.0, jnp.clip(jnp.ceil(_min_of_three(pixel) - _MARGIN), 0, count))
+    stop = jnp.where(is_crossing, count, jnp.clip(jnp.floor(_max_of_three(pixel) + _MARGIN) + 1.0, 0, count))
     stop = jnp.where(is_outside, first, jnp.maximum(first, stop))
     return first.astype(jnp.int32) | (stop.astype(jnp.int32) << 16)
 
 
 def _is_front(x: list[Array], y: list[Array], w: list[Array]) -> Array:
-    """Returns bool[T]: the corners run counterclockwise; true where one is behind the viewer."""
+    """Returns bool[T]: the corners run counterclockwise (the front is seen), or a corner is behind the viewer."""
     inverse = [1.0 / jnp.where(b > _NEAR, b, 1.0) for b in w]
     u, v = ([a * b for a, b in zip(axis, inverse, strict=True)] for axis in (x, y))
     area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
-    return (area > 0.0) | (_least(w) <= _NEAR)
+    return (area > 0.0) | (_min_of_three(w) <= _NEAR)
 
 
-def _rectangles(triangles: Triangles, view: View, size: tuple[int, int], zero: Array) -> tuple[Array, Array]:
-    """Returns the columns and the rows of the pixels that each face may cover, as `_extent` does."""
-    pose = _per_face(view.pose, triangles.geom)
+def _bounding_rectangles(
+    triangles: Triangles, projection: Projection, size: tuple[int, int], zero: Array
+) -> tuple[Array, Array]:
+    """Returns the columns and the rows of the rectangle that holds each face, as `Pairs` has them."""
+    pose = _rows_of_faces(projection.pose, triangles.geom)
     points = [(corner[0], corner[1], corner[2]) for corner in triangles.corners]
-    x, y, w, _ = (list(values) for values in zip(*(_corner(view, pose, point) for point in points), strict=True))
-    pinhole = view.pinhole
-    columns = _extent(x, w, pinhole.scale_x, pinhole.center_x, size[1])
-    rows = _extent([-a for a in y], w, pinhole.scale_y, pinhole.center_y, size[0])
-    is_culled = _per_face(view.is_culled[None], triangles.geom)[0]
+    corners = (_to_view(projection, pose, point) for point in points)
+    x, y, w, _ = (list(values) for values in zip(*corners, strict=True))
+    pinhole = projection.pinhole
+    columns = _pixel_interval(x, w, pinhole.scale_x, pinhole.center_x, size[1])
+    rows = _pixel_interval([-a for a in y], w, pinhole.scale_y, pinhole.center_y, size[0])
+    is_culled = _rows_of_faces(projection.is_culled[None], triangles.geom)[0]
     rows = jnp.where((is_culled > 0.0) & ~_is_front(x, y, w), 0, rows)
     return materialize((columns, rows), zero)
 
 
-def _running_maximum(values: Array) -> Array:
-    """Returns i32[N], the largest value so far, all 0 or more, in two steps: XLA's own is slow on long arrays."""
-    blocks = jax.lax.cummax(values.reshape(-1, 64), axis=1)
-    last = jax.lax.cummax(blocks[:, -1])
-    before = jnp.concatenate([jnp.zeros_like(last[:1]), last[:-1]])
-    return jnp.maximum(blocks, before[:, None]).reshape(-1)
+def _depth_of_hits(
+    triangles: Triangles, projection: Projection, face: Array, pixel: tuple[Array, Array], zero: Array
+) -> Array:
+    """Returns the depth at which rays meet faces (Woop et al. 2013; see the module's docstring).
 
+    Args:
+      triangles: Triangles.
+      projection: Projection.
+      face: i32[N].
+      pixel: f32[N] column and f32[N] row of the pixels whose rays are tested.
+      zero: see `materialize`.
 
-def _faces_of_pairs(begin: Array, end: Array, start: Array) -> Array:
-    """Returns i32[_PART], the faces to which the pairs from `start` on belong."""
-    num_faces = begin.shape[0]
-    offset = begin - start
-    # Faces without a pixel begin where the next one does, and give way to it.
-    slot = jnp.where((offset >= 0) & (offset < _PART), offset, _PART)
-    first = jnp.minimum(jnp.sum(end <= start), num_faces - 1).astype(jnp.int32)
-    faces = jnp.full(_PART, first, jnp.int32).at[slot].max(jnp.arange(num_faces, dtype=jnp.int32), mode="drop")
-    return faces
-
-
-def _depth_at(triangles: Triangles, view: View, face: Array, pixel: tuple[Array, Array], zero: Array) -> Array:
-    """Returns f32[N] m, where the rays of `pixel` (column, row) meet `face`, +inf where they do not.
-
-    Corners are sheared so that the ray is the axis; then the areas that it cuts off are precise even of the smallest
-    face, and the same for both faces of an edge (Woop et al., Watertight ray/triangle intersection, 2013).
+    Returns:
+      f32[N] m; +inf where the ray of a pixel misses the face.
     """
-    pinhole = view.pinhole
+    pinhole = projection.pinhole
     ray_x = (pixel[0] - pinhole.center_x) / pinhole.scale_x
     ray_y = (pinhole.center_y - pixel[1]) / pinhole.scale_y
     table = triangles.corners.reshape(9, -1)
     axes = materialize([_take(row, face) for row in table], zero)
-    geom = face if view.pose.shape[1] == 1 else materialize(_take(triangles.geom, face), zero)
-    pose = _per_face(view.pose, geom)
-    x, y, depth = [], [], []
+    geom = face if projection.pose.shape[1] == 1 else materialize(_take(triangles.geom, face), zero)
+    pose = _rows_of_faces(projection.pose, geom)
+    x: list[Array] = []
+    y: list[Array] = []
+    depth: list[Array] = []
     for i in (0, 3, 6):
-        corner_x, corner_y, w, corner_depth = _corner(view, pose, (axes[i], axes[i + 1], axes[i + 2]))
+        corner_x, corner_y, w, corner_depth = _to_view(projection, pose, (axes[i], axes[i + 1], axes[i + 2]))
         x.append(corner_x - ray_x * w)
         y.append(corner_y - ray_y * w)
         depth.append(corner_depth)
     areas = [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
-    whole = areas[0] + areas[1] + areas[2]
-    met = (areas[0] * depth[0] + areas[1] * depth[1] + areas[2] * depth[2]) / jnp.where(whole == 0.0, 1.0, whole)
-    is_met = ((_least(areas) >= 0.0) | (_most(areas) <= 0.0)) & (whole != 0.0)
-    return jnp.where(is_met & (view.is_parallel | (met > 0.0)), met, jnp.inf)  # pyright: ignore[reportReturnType] # an array
+    total = areas[0] + areas[1] + areas[2]
+    hit_depth = (areas[0] * depth[0] + areas[1] * depth[1] + areas[2] * depth[2]) / jnp.where(total == 0.0, 1.0, total)
+    is_inside = ((_min_of_three(areas) >= 0.0) | (_max_of_three(areas) <= 0.0)) & (total != 0.0)
+    return jnp.where(is_inside & (projection.is_parallel | (hit_depth > 0.0)), hit_depth, jnp.inf)
 
 
-class _Pairs(NamedTuple):
-    columns: Array
-    rows: Array
-    begin: Array
-    end: Array
+def _has_pairs_left(pairs: Pairs, state: tuple[Array, Array, Array]) -> Array:
+    return state[0] < pairs.stop[-1]
 
 
-def _is_left(pairs: _Pairs, state: tuple[Array, Array, Array]) -> Array:
-    return state[0] < pairs.end[-1]
-
-
-def _test_part(
+def _test_batch(
     triangles: Triangles,
-    view: View,
-    pairs: _Pairs,
+    projection: Projection,
+    pairs: Pairs,
     context: tuple[tuple[int, int], Array],
     state: tuple[Array, Array, Array],
 ) -> tuple[Array, Array, Array]:
+    """Tests the next batch of pairs. The state holds the next pair's number, and depth and face of each pixel."""
     (height, width), zero = context
     start, best, faces = state
     num_pixels = height * width
-    face = _running_maximum(materialize(_faces_of_pairs(pairs.begin, pairs.end, start), zero))
-    face = materialize(face, zero)
-    columns, rows, begin = materialize([_take(t, face) for t in (pairs.columns, pairs.rows, pairs.begin)], zero)
-    number = start + jnp.arange(_PART, dtype=jnp.int32)
-    first_column, first_row = columns & 0xFFFF, rows & 0xFFFF
-    box_width = jnp.maximum((columns >> 16) - first_column, 1)
-    rank = number - begin
-    # A division of floats, as that of integers is not vectorised; its rounding is mended.
-    row = jnp.floor((rank.astype(jnp.float32) + 0.5) / box_width.astype(jnp.float32)).astype(jnp.int32)
-    row = row + jnp.where(rank < row * box_width, -1, jnp.where(rank >= (row + 1) * box_width, 1, 0))
-    row, column = materialize((first_row + row, first_column + rank - row * box_width), zero)
+    face = faces_of_pairs(pairs, start, _BATCH, zero)
+    columns, rows, first = materialize([_take(t, face) for t in (pairs.columns, pairs.rows, pairs.first)], zero)
+    number = start + jnp.arange(_BATCH, dtype=jnp.int32)
+    row, column = materialize(pixels_of_pairs(columns, rows, first, number), zero)
     pixel = (column.astype(jnp.float32), row.astype(jnp.float32))
-    depth = materialize(_depth_at(triangles, view, face, pixel, zero), zero)
-    is_met = (number < pairs.end[-1]) & (depth < jnp.inf)
-    target = materialize(jnp.where(is_met, row * width + column, num_pixels), zero)
+    depth = materialize(_depth_of_hits(triangles, projection, face, pixel, zero), zero)
+    is_hit = (number < pairs.stop[-1]) & (depth < jnp.inf)
+    target = materialize(jnp.where(is_hit, row * width + column, num_pixels), zero)
     best = best.at[target].min(depth, mode="drop")
     is_best = depth <= _take(best, jnp.minimum(target, num_pixels - 1))
     faces = faces.at[jnp.where(is_best, target, num_pixels)].set(face, mode="drop")
-    return start + _PART, best, faces
+    return start + _BATCH, best, faces
 
 
-def rasterize(triangles: Triangles, view: View, size: tuple[int, int], zero: Array) -> Raster:
+def rasterize(triangles: Triangles, projection: Projection, size: tuple[int, int], zero: Array) -> Raster:
     """Returns the nearest face of each pixel.
 
     Args:
       triangles: Triangles.
-      view: View.
-      size: height and width in pixels, each at most 32,767, static.
-      zero: see `boundary.materialize`.
+      projection: Projection of the geoms of `triangles`.
+      size: height and width in pixels, each at most 32,767; static.
+      zero: i32[], 0 at run time; see `vsearch_jax.xla.materialize`.
 
     Returns:
-      Raster, its depth NaN where there are more pairs of face and pixel than 31 bits can count.
+      Raster of that size. All its depths are NaN if there are more than about 2^31 pairs of face and pixel.
     """
-    columns, rows = _rectangles(triangles, view, size, zero)
-    count = ((columns >> 16) - (columns & 0xFFFF)) * ((rows >> 16) - (rows & 0xFFFF))
-    end = materialize(jnp.cumsum(count), zero)
-    pairs = _Pairs(columns, rows, materialize(end - count, zero), end)
+    columns, rows = _bounding_rectangles(triangles, projection, size, zero)
+    count = count_pairs(columns, rows)
+    stop = materialize(jnp.cumsum(count), zero)
+    pairs = Pairs(columns, rows, materialize(stop - count, zero), stop)
     num_pixels = size[0] * size[1]
     initial = (jnp.zeros_like(zero), jnp.full(num_pixels, jnp.inf, jnp.float32), jnp.zeros(num_pixels, jnp.int32))
-    step = functools.partial(_test_part, triangles, view, pairs, (size, zero))
-    _, depth, face = jax.lax.while_loop(functools.partial(_is_left, pairs), step, initial)
-    depth = jnp.where(jnp.sum(count.astype(jnp.float32)) < _MOST_PAIRS, depth, jnp.nan)
+    step = functools.partial(_test_batch, triangles, projection, pairs, (size, zero))
+    _, depth, face = jax.lax.while_loop(functools.partial(_has_pairs_left, pairs), step, initial)
+    depth = jnp.where(jnp.sum(count.astype(jnp.float32)) < _MAX_PAIRS, depth, jnp.nan)
     return Raster(depth.reshape(size), face.reshape(size))

@@ -1,8 +1,12 @@
-"""Where the lights are as the camera sees them, and how they meet what each pixel shows."""
+"""The lights of a scene at each pixel: poses in the camera's frame, shadows, and the terms of the light model.
+
+Shadows have two sources. Shadows of primitives come from exact shadow rays (`trace.is_lit`). Shadows of meshes and
+height fields come from shadow maps (`shadow_map`). A pixel is lit if both say so. Shadows have no derivative.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +15,14 @@ from jax import Array
 from vsearch_jax.render import trace
 from vsearch_jax.render.light import shading, shadow_map
 from vsearch_jax.render.light.shadow_map import ShadowMap
+from vsearch_jax.render.mj_poses import GeomPoses
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.types import Camera
 from vsearch_jax.xla.vectors import Vector
 
 
 class LightPoses(NamedTuple):
-    """The lights in the camera's frame.
+    """The lights in the camera's frame; L is their number.
 
     Attributes:
       position: f32[L, 3] m.
@@ -28,8 +33,14 @@ class LightPoses(NamedTuple):
     direction: Array
 
 
-def light_poses(scene: RenderScene, data: Any, camera: Camera) -> LightPoses:
-    """Returns where the lights are: fixed in the world, or in the frames of the bodies that carry them."""
+def light_poses(scene: RenderScene, data: GeomPoses, camera: Camera) -> LightPoses:
+    """Returns the poses of the scene's lights in the camera's frame.
+
+    Args:
+      scene: RenderScene. Its lights are fixed in the world or in the frames of bodies.
+      data: poses in world. Only `xpos` and `xmat` are read, and only if a body carries a light.
+      camera: Camera.
+    """
     positions, directions = [], []
     for index, body in enumerate(scene.lights.bodies):
         position, direction = scene.lights.position[index], scene.lights.direction[index]
@@ -44,37 +55,41 @@ def light_poses(scene: RenderScene, data: Any, camera: Camera) -> LightPoses:
     return LightPoses(jnp.stack(positions), jnp.stack(directions))
 
 
-def _shadowing(scene: RenderScene) -> list[int]:
+def _shadow_casters(scene: RenderScene) -> list[int]:
+    """Returns the rows of the lights that cast shadows."""
     return [i for i, casts in enumerate(scene.lights.is_shadowing) if casts and scene.has_shadows]
 
 
-def _place(scene: RenderScene, poses: LightPoses, index: int) -> tuple[Array, bool]:
-    """Returns the light's position, or the direction towards it; and whether it is the latter."""
+def _light_source(scene: RenderScene, poses: LightPoses, index: int) -> tuple[Array, bool]:
+    """Returns f32[3] and whether the light is directional: a direction towards such a light, else a position in m."""
     is_directional = scene.lights.is_directional[index]
     return (-poses.direction[index] if is_directional else poses.position[index]), is_directional
 
 
 def needs_shadow_maps(scene: RenderScene) -> bool:
-    """Returns whether faces cast shadows."""
-    return scene.triangles is not None and bool(_shadowing(scene))
+    """Returns whether the scene has meshes or height fields and a light that casts shadows."""
+    return scene.triangles is not None and bool(_shadow_casters(scene))
 
 
 def shadow_maps(
     scene: RenderScene, frames: trace.Frames, poses: LightPoses, seen: tuple[Vector, Array], zero: Array
 ) -> dict[int, ShadowMap]:
-    """Returns the shadows of faces by the light's number; `seen` is what `shadow_map.cast` takes."""
-    return {i: shadow_map.cast(scene, frames, seen, _place(scene, poses, i), zero) for i in _shadowing(scene)}
+    """Returns the shadow maps of meshes and height fields.
 
+    Args:
+      scene: RenderScene with triangles.
+      frames: Frames of the geoms.
+      poses: LightPoses.
+      seen: points that the camera sees, three f32[...] m in its frame, and bool[...], whether the pixel hits a geom.
+      zero: i32[], 0 at run time; see `vsearch_jax.xla.materialize`.
 
-def _is_lit(
-    scene: RenderScene,
-    frames: trace.Frames,
-    hits: trace.Hits,
-    light: tuple[Array, bool],
-    rays: tuple[Array, Array],
-) -> Array:
-    fixed = jax.lax.stop_gradient((scene, frames, hits, rays, light[0]))
-    return trace.is_lit(*fixed, light[1])
+    Returns:
+      A ShadowMap for each light that casts shadows, by the light's row.
+    """
+    return {
+        i: shadow_map.draw_shadow_map(scene, frames, seen, _light_source(scene, poses, i), zero)
+        for i in _shadow_casters(scene)
+    }
 
 
 def lit_by(
@@ -85,15 +100,28 @@ def lit_by(
     lights: tuple[LightPoses, dict[int, ShadowMap]],
     surface: shading.Surface,
 ) -> dict[int, Array]:
-    """Returns f32[H, W], 0 in the shadow and 1 elsewhere, by the number of each light that casts shadows."""
+    """Returns which pixels each shadow-casting light reaches.
+
+    Args:
+      scene: RenderScene.
+      frames: Frames of the geoms.
+      hits: Hits of the pixels, with exact depths.
+      rays: slopes of the pixels' rays, f32[1, W] and f32[H, 1].
+      lights: LightPoses, and what `shadow_maps` returned; an empty dictionary without triangles.
+      surface: Surface of the pixels.
+
+    Returns:
+      f32[H, W], 0 in the shadow and 1 elsewhere, for each light that casts shadows, by the light's row.
+    """
     poses, maps = jax.lax.stop_gradient(lights)
     lit = {}
-    for index in _shadowing(scene):
-        light = _place(scene, poses, index)
-        lit[index] = _is_lit(scene, frames, hits, light, rays)
+    for index in _shadow_casters(scene):
+        source, is_directional = _light_source(scene, poses, index)
+        fixed = jax.lax.stop_gradient((scene, frames, hits, rays, source))
+        lit[index] = trace.is_lit(*fixed, is_directional)
         if index in maps:
             point, normal = jax.lax.stop_gradient((surface.point, surface.flat))
-            lit[index] *= shadow_map.is_lit(maps[index], point, normal, light[1], scene.shadow_offset)
+            lit[index] *= shadow_map.is_lit(maps[index], point, normal, is_directional, scene.shadow_offset)
     return lit
 
 
@@ -104,19 +132,31 @@ def incidences(
     rays: tuple[Array, Array],
     lit: dict[int, Array],
 ) -> list[shading.Incidence]:
-    """Returns how the scene's lights in their order, then the headlight, meet each pixel's surface."""
-    view, result, one = _view(*rays), [], jnp.ones((), dtype=jnp.float32)
+    """Returns the terms of all lights at each pixel's surface.
+
+    Args:
+      scene: RenderScene.
+      poses: LightPoses.
+      surface: Surface of the pixels.
+      rays: slopes of the pixels' rays, f32[1, W] and f32[H, 1].
+      lit: what `lit_by` returned. A light that is missing there has no shadows.
+
+    Returns:
+      Incidence of each light of the scene in order, then of the headlight, which shines along the camera's axis.
+    """
+    to_camera, result, one = _to_camera(*rays), [], jnp.ones((), dtype=jnp.float32)
     for index, is_directional in enumerate(scene.lights.is_directional):
         is_lit = lit.get(index, one)
         if is_directional:
-            result.append(shading.directional_incidence(surface, view, -poses.direction[index], is_lit))
+            result.append(shading.directional_incidence(surface, to_camera, -poses.direction[index], is_lit))
         else:
             pose = (poses.position[index], poses.direction[index])
-            result.append(shading.positional_incidence(surface, view, pose, scene.lights, index, is_lit))
-    forward = jnp.array([0.0, 0.0, 1.0], dtype=jnp.float32)
-    return [*result, shading.directional_incidence(surface, view, forward, one)]
+            result.append(shading.positional_incidence(surface, to_camera, pose, scene.lights, index, is_lit))
+    backward = jnp.array([0.0, 0.0, 1.0], dtype=jnp.float32)
+    return [*result, shading.directional_incidence(surface, to_camera, backward, one)]
 
 
-def _view(x: Array, y: Array) -> Vector:
+def _to_camera(x: Array, y: Array) -> Vector:
+    """Returns unit vectors to the camera from points on the rays of slopes `x` and `y`."""
     inverse = 1.0 / jnp.sqrt(x * x + y * y + 1.0)
     return -x * inverse, -y * inverse, inverse

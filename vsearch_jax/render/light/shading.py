@@ -1,4 +1,11 @@
-"""MuJoCo's light model: OpenGL's ambient, diffuse and specular terms of every light, per pixel."""
+"""MuJoCo's light model, evaluated in every pixel: OpenGL's ambient, diffuse and specular terms of every light.
+
+The formulas are those of the OpenGL 2.1 specification, section 2.14.1, with the settings that MuJoCo makes in
+render_gl3.c (`initLights`, `adjustLight`, `renderGeom`): a local viewer, one-sided lighting, ambient and diffuse colour
+from the geom, one specular value per geom. OpenGL evaluates them at the vertices, this module at each pixel.
+
+All positions and directions are in the camera's frame.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +17,23 @@ from jax import Array
 from vsearch_jax.render.scene import Lights, RenderScene
 from vsearch_jax.xla.vectors import Vector, dot
 
+# Lower bound of squared lengths, so that the gradients of their roots are finite.
 _TINY = 1e-12
 
 
 class Surface(NamedTuple):
-    """What each pixel shows, in the camera's frame.
+    """The surface that each pixel shows, in the camera's frame.
 
     Attributes:
       point: three f32[H, W] m.
-      normal: three f32[H, W], unit, towards the camera's side, of the smooth surface that a face stands for.
-      flat: three f32[H, W], the same of the face itself; `normal` elsewhere.
+      normal: three f32[H, W], unit, towards the camera's side. On a face it is the interpolated smooth normal.
+      flat: three f32[H, W], unit, towards the camera's side. On a face it is the normal of the face's plane, elsewhere
+        it equals `normal`.
       rgb: three f32[H, W] in [0, 1].
-      specular: f32[H, W].
-      shininess: f32[H, W].
-      emission: f32[H, W].
-      tint: three f32[H, W], by which a texture multiplies the lit colour, or None without textures.
+      specular: f32[H, W] in [0, 1].
+      shininess: f32[H, W], exponent of the highlight.
+      emission: f32[H, W], emitted light in units of `rgb`.
+      tint: three f32[H, W], colour of the texture, which multiplies the lit colour; None in a scene without textures.
     """
 
     point: Vector
@@ -38,12 +47,12 @@ class Surface(NamedTuple):
 
 
 class Incidence(NamedTuple):
-    """How a light meets each pixel's surface.
+    """The terms of one light at each pixel's surface.
 
     Attributes:
-      strength: f32[H, W], what distance, cone and shadows leave of the light.
-      diffuse: f32[H, W], cosine at the surface, 0 or more.
-      specular: f32[H, W], the highlight, 0 or more.
+      strength: f32[H, W], the part of the light that arrives, after attenuation, cone and shadows.
+      diffuse: f32[H, W], cosine of the angle of incidence, at least 0.
+      specular: f32[H, W], intensity of the highlight, at least 0.
     """
 
     strength: Array
@@ -51,71 +60,74 @@ class Incidence(NamedTuple):
     specular: Array
 
 
-def _incidence(surface: Surface, view: Vector, to_light: Vector, strength: Array) -> Incidence:
-    """Blinn's highlight with a viewer at the camera (OpenGL 2.1 specification, 2.14.1)."""
+def _incidence(surface: Surface, to_camera: Vector, to_light: Vector, strength: Array) -> Incidence:
+    """Returns the terms of a light in direction `to_light`: Lambert's diffuse term and Blinn's highlight."""
     cosine = dot(surface.normal, to_light)
-    # half = (to_light + view) / |to_light + view|
-    inverse = 1.0 / jnp.sqrt(jnp.maximum(2.0 + 2.0 * dot(to_light, view), _TINY))
-    half_cosine = (cosine + dot(surface.normal, view)) * inverse
+    # The half vector is (to_light + to_camera) / |to_light + to_camera|.
+    inverse = 1.0 / jnp.sqrt(jnp.maximum(2.0 + 2.0 * dot(to_light, to_camera), _TINY))
+    half_cosine = (cosine + dot(surface.normal, to_camera)) * inverse
     highlight = jnp.exp(surface.shininess * jnp.log(jnp.clip(half_cosine, 1e-6, 1.0)))
     return Incidence(strength, jnp.maximum(cosine, 0.0), jnp.where(cosine > 0.0, highlight, 0.0))
 
 
-def directional_incidence(surface: Surface, view: Vector, to_light: Array, is_lit: Array) -> Incidence:
-    """Returns how a light at infinity meets the surface.
+def directional_incidence(surface: Surface, to_camera: Vector, to_light: Array, is_lit: Array) -> Incidence:
+    """Returns the terms of a directional light.
 
     Args:
       surface: Surface.
-      view: three f32[H, W], unit vectors from the surface towards the camera.
-      to_light: f32[3], unit vector towards the light in the camera's frame.
-      is_lit: f32[H, W], 0 in the shadow, 1 elsewhere.
+      to_camera: three f32[H, W], unit vectors from the surface to the camera.
+      to_light: f32[3], unit vector towards the light.
+      is_lit: f32[H, W] or f32[], 0 in the shadow, 1 elsewhere.
     """
-    return _incidence(surface, view, (to_light[0], to_light[1], to_light[2]), is_lit)
+    return _incidence(surface, to_camera, (to_light[0], to_light[1], to_light[2]), is_lit)
 
 
 def positional_incidence(
-    surface: Surface, view: Vector, pose: tuple[Array, Array], lights: Lights, index: int, is_lit: Array
+    surface: Surface, to_camera: Vector, pose: tuple[Array, Array], lights: Lights, index: int, is_lit: Array
 ) -> Incidence:
-    """Returns how light `index`, a spot or a point, meets the surface.
+    """Returns the terms of a spot or point light.
 
     Args:
       surface: Surface.
-      view: three f32[H, W], unit vectors from the surface towards the camera.
-      pose: f32[3] m and f32[3], position and direction of the light in the camera's frame.
-      lights: for attenuation, cutoff and exponent.
-      index: the light's number in `lights`.
-      is_lit: f32[H, W], 0 in the shadow, 1 elsewhere.
+      to_camera: three f32[H, W], unit vectors from the surface to the camera.
+      pose: position f32[3] m and direction f32[3], unit, of the light.
+      lights: Lights, for attenuation, cutoff and exponent.
+      index: row of the light in `lights`; static.
+      is_lit: f32[H, W] or f32[], 0 in the shadow, 1 elsewhere.
     """
     position, direction = pose
-    way = (position[0] - surface.point[0], position[1] - surface.point[1], position[2] - surface.point[2])
-    distance = jnp.sqrt(jnp.maximum(dot(way, way), _TINY))
-    to_light = (way[0] / distance, way[1] / distance, way[2] / distance)
+    offset = (position[0] - surface.point[0], position[1] - surface.point[1], position[2] - surface.point[2])
+    distance = jnp.sqrt(jnp.maximum(dot(offset, offset), _TINY))
+    to_light = (offset[0] / distance, offset[1] / distance, offset[2] / distance)
     constant, linear, quadratic = lights.attenuation[index]
-    fading = 1.0 / (constant + distance * (linear + distance * quadratic))
+    attenuation = 1.0 / (constant + distance * (linear + distance * quadratic))
     axis_cosine = -(to_light[0] * direction[0] + to_light[1] * direction[1] + to_light[2] * direction[2])
     cone = jnp.exp(lights.exponent[index] * jnp.log(jnp.clip(axis_cosine, 1e-6, 1.0)))
-    # A cutoff of pi is a point light: all around.
+    # A point light has a cutoff of pi, so its cone holds all directions.
     cone = jnp.where(axis_cosine >= jnp.cos(lights.cutoff[index]), cone, 0.0)
-    return _incidence(surface, view, to_light, is_lit * fading * cone)
+    return _incidence(surface, to_camera, to_light, is_lit * attenuation * cone)
 
 
 def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> list[Array]:
-    """Returns red, green and blue, f32[H, W] in [0, 1].
+    """Returns the lit colour of each pixel.
 
     Args:
-      scene: materials and colours of the lights.
+      scene: RenderScene, for the colours of the lights.
       surface: Surface.
-      incidences: of the scene's lights in their order, then of the headlight.
+      incidences: Incidence of each light of the scene in order, then of the headlight.
+
+    Returns:
+      Red, green and blue, f32[H, W] in [0, 1] each.
     """
     lights = scene.lights
     colours = [(lights.ambient[i], lights.diffuse[i], lights.specular[i]) for i in range(len(lights.is_directional))]
     colours.append((scene.headlight_ambient, scene.headlight_diffuse, scene.headlight_specular))
     channels = []
     for i in range(3):
-        matte, gloss = surface.emission + scene.ambient[i], 0.0
+        base, highlight = surface.emission + scene.ambient[i], 0.0
         for (ambient, diffuse, specular), light in zip(colours, incidences, strict=True):
-            matte += light.strength * (ambient[i] + diffuse[i] * light.diffuse)
-            gloss += light.strength * specular[i] * light.specular
-        lit = jnp.clip(surface.rgb[i] * matte + surface.specular * gloss, 0.0, 1.0)
+            base += light.strength * (ambient[i] + diffuse[i] * light.diffuse)
+            highlight += light.strength * specular[i] * light.specular
+        lit = jnp.clip(surface.rgb[i] * base + surface.specular * highlight, 0.0, 1.0)
         channels.append(lit if surface.tint is None else lit * surface.tint[i])
     return channels

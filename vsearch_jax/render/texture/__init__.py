@@ -1,1 +1,1 @@
-"""Textures: compiled into one atlas, looked up for each pixel."""
+"""Textures: the atlas of texels, and their lookup at each pixel."""
