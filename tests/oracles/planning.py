@@ -1,4 +1,4 @@
-"""What C MuJoCo says of joint paths: contact and the table's clearance, sampled densely."""
+"""Contacts and table clearance of joint paths by C MuJoCo, sampled densely."""
 
 import itertools
 
@@ -8,8 +8,8 @@ import numpy as np
 from vsearch_jax.scene import Scene
 
 
-class Oracle:
-    """Looks at configurations of a scene."""
+class ContactOracle:
+    """Checks configurations of a scene with C MuJoCo."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.model = scene, scene.mj_model
@@ -17,7 +17,8 @@ class Oracle:
         fixed = {g for g in range(self.model.ngeom) if self.model.body_weldid[self.model.geom_bodyid[g]] == 0}
         self.moving = [g for g in scene.arm_geom_ids if g not in fixed]
 
-    def look(self, qpos: np.ndarray) -> mujoco.MjData:
+    def compute_contacts(self, qpos: np.ndarray) -> mujoco.MjData:
+        """Returns MuJoCo's data with kinematics and contacts at `qpos`."""
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
@@ -26,17 +27,17 @@ class Oracle:
         return self.data
 
     def is_free(self, qpos: np.ndarray) -> bool:
-        """Nothing touches and the table's clearance is kept, but for what float32 rounds."""
-        data = self.look(qpos)
+        """Returns whether nothing touches and the table's clearance is kept, up to rounding in float32."""
+        data = self.compute_contacts(qpos)
         return data.ncon == 0 and self.table_distance() > self.scene.table_clearance - 1e-5
 
     def table_distance(self) -> float:
-        """By the lowest points of capsules, the only shape of the arm's geoms here."""
+        """Returns the distance in m of the lowest point of the arm, whose moving geoms must all be capsules."""
         size, rotation = self.model.geom_size, self.data.geom_xmat.reshape(-1, 3, 3)
         lowest = [self.data.geom_xpos[g, 2] - abs(rotation[g, 2, 2]) * size[g, 1] - size[g, 0] for g in self.moving]
         return min(lowest) - self.scene.table_height
 
-    def blocked(self, waypoints: np.ndarray, spacing: float = 0.01) -> int:
+    def count_blocked(self, waypoints: np.ndarray, spacing: float = 0.01) -> int:
         """Returns how many samples of the path, `spacing` rad apart, are not free."""
         count = 0
         for start, end in itertools.pairwise(waypoints):
@@ -47,8 +48,8 @@ class Oracle:
 
 
 def free_joints(scene: Scene, lower: np.ndarray, upper: np.ndarray, seed: int, count: int) -> np.ndarray:
-    """Returns f32[count, nq] random free configurations."""
-    oracle, random, found = Oracle(scene), np.random.default_rng(seed), []
+    """Returns f32[count, nq], random free configurations between `lower` and `upper`."""
+    oracle, random, found = ContactOracle(scene), np.random.default_rng(seed), []
     while len(found) < count:
         qpos = random.uniform(lower, upper).astype(np.float32)
         if oracle.is_free(qpos) and oracle.table_distance() > scene.table_clearance + 1e-4:

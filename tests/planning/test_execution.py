@@ -1,4 +1,4 @@
-"""Dynamic motion: it ends where the plan says, inside the torques of the data sheet, as C MuJoCo has it too."""
+"""Dynamic motions end where they are planned, within the data sheet's torques, and equal those of C MuJoCo."""
 
 import jax
 import jax.numpy as jnp
@@ -6,21 +6,21 @@ import mujoco
 import numpy as np
 import pytest
 
-from oracles.planning import Oracle
+from oracles.planning import ContactOracle
 from vsearch_jax.config import IKConfig, PlanningConfig, SceneConfig
 from vsearch_jax.geometry import rotation_error, view_pose
-from vsearch_jax.planning import ik, rrt_connect, state_at, time_path
-from vsearch_jax.planning.execution import execute
+from vsearch_jax.planning import execute, ik, rrt_connect, state_at, time_path
 from vsearch_jax.robot.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.scene import build_scene
 from vsearch_jax.types import View
 
 CONFIG = PlanningConfig()
+# N m, largest torques of the LWR's joints by its data sheet.
 TORQUES = np.array([176, 176, 100, 100, 100, 38, 38])
 
 
-def _moves(count: int):
-    """Executions of moves between random views of the band, with the joints that were planned for their ends."""
+def _execute_moves(count: int):
+    """Executions of moves between random views of the band, with their planned paths and errors at the end."""
     scene = build_scene(SceneConfig())
     arm = build_arm(scene)
     random = np.random.default_rng(4)
@@ -40,22 +40,22 @@ def _moves(count: int):
     found = np.asarray(paths.status) == 0
     paths = jax.tree.map(lambda leaf: leaf[found], paths)
 
-    def drive(path):
+    def execute_path(path):
         trajectory = time_path(arm, path, CONFIG)
         done = execute(arm, scene.mjx_model, trajectory, CONFIG)
         reached, wanted = (camera_pose(arm, forward_kinematics(arm, q)) for q in (done.qpos, path.waypoints[-1]))
         position = jnp.linalg.norm(reached.translation() - wanted.translation())
-        turn = rotation_error(reached.rotation().as_matrix(), wanted.rotation().as_matrix())
-        return trajectory, done, position, turn
+        angle = rotation_error(reached.rotation().as_matrix(), wanted.rotation().as_matrix())
+        return trajectory, done, position, angle
 
-    return scene, arm, paths, *jax.jit(jax.vmap(drive))(paths), found
+    return scene, arm, paths, *jax.jit(jax.vmap(execute_path))(paths), found
 
 
 def _check(moves, share: float) -> None:
-    _, _, paths, _, done, position, turn, found = moves
+    _, _, paths, _, done, position, angle, found = moves
     assert found.mean() >= 0.98
-    is_there = (np.asarray(position) < 1e-3) & (np.asarray(turn) < np.deg2rad(0.2))
-    assert is_there.mean() >= share
+    has_arrived = (np.asarray(position) < 1e-3) & (np.asarray(angle) < np.deg2rad(0.2))
+    assert has_arrived.mean() >= share
     assert np.all(np.asarray(done.peak_torque)[:, :7] <= TORQUES + 1e-3)
     assert np.all(np.asarray(done.energy) > 0.0) and np.all(np.asarray(done.energy) < 1000.0)
     np.testing.assert_allclose(done.qpos, np.asarray(paths.waypoints)[:, -1], atol=0.02)
@@ -63,7 +63,7 @@ def _check(moves, share: float) -> None:
 
 @pytest.fixture(scope="module")
 def moves():
-    return _moves(4)
+    return _execute_moves(4)
 
 
 @pytest.mark.slow
@@ -72,14 +72,15 @@ def test_the_arm_ends_at_the_planned_view(moves):
 
 
 @pytest.mark.slow
-def test_c_mujoco_follows_the_same_way_without_contact(moves):
+def test_c_mujoco_makes_the_same_motion_without_contact(moves):
     scene, arm, paths, trajectories, done, _, _, _ = moves
-    model, oracle = scene.mj_model, Oracle(scene)
-    at = jax.jit(jax.vmap(lambda trajectory, t: state_at(arm, trajectory, t), in_axes=(None, 0)))
+    model, oracle = scene.mj_model, ContactOracle(scene)
+    states_at = jax.jit(jax.vmap(lambda trajectory, t: state_at(arm, trajectory, t), in_axes=(None, 0)))
     trajectory = jax.tree.map(lambda leaf: leaf[0], trajectories)
     count = round(float(done.time[0]) / model.opt.timestep)
     joints, velocity = (
-        np.asarray(x) for x in at(trajectory, np.arange(count, dtype=np.float32) * np.float32(model.opt.timestep))
+        np.asarray(x)
+        for x in states_at(trajectory, np.arange(count, dtype=np.float32) * np.float32(model.opt.timestep))
     )
     lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0]
     data = mujoco.MjData(model)
@@ -95,4 +96,4 @@ def test_c_mujoco_follows_the_same_way_without_contact(moves):
 
 @pytest.mark.slow
 def test_five_hundred_moves_end_at_their_views():
-    _check(_moves(500), 0.99)
+    _check(_execute_moves(500), 0.99)

@@ -1,3 +1,5 @@
+"""Inverse kinematics and the reachability map, compared with C MuJoCo and with the geometry of the LWR."""
+
 import dataclasses
 import functools
 
@@ -12,14 +14,14 @@ from samples.second_arm import MJCF
 from vsearch_jax.config import IKConfig, SceneConfig
 from vsearch_jax.geometry import view_pose
 from vsearch_jax.planning import ik, ik_from_starts, nearest_cell, reachability_map, solve_view, start_limits
-from vsearch_jax.planning.starts import rank
+from vsearch_jax.planning.starts import ranking_cost
 from vsearch_jax.robot.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.scene import build_scene
 from vsearch_jax.types import IKResult, IKStatus, View
 
 CONFIG = IKConfig(map_azimuths=12, map_elevations=19, map_seeds=16)
 NUM_POSES = 2000
-# Shoulder to wrist of the LWR: the arm stretched, and with A4 at its 120 degrees.
+# Distance in m from shoulder to wrist of the LWR: with the arm stretched, and with A4 at its limit of 120 degrees.
 FARTHEST = 0.79
 NEAREST = np.sqrt(0.4**2 + 0.39**2 - 2 * 0.4 * 0.39 * np.cos(np.deg2rad(60)))
 
@@ -40,13 +42,13 @@ def sphere(scene):
 
 
 @jax.jit
-def _map(arm, center, radius):
+def _compute_map(arm, center, radius):
     return reachability_map(arm, center, radius, CONFIG, jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
 def reach(arm, sphere):
-    return _map(arm, *sphere)
+    return _compute_map(arm, *sphere)
 
 
 def _random_joints(arm, seed: int, count: int) -> np.ndarray:
@@ -92,7 +94,7 @@ def test_ik_solves_poses_that_are_reachable_by_construction(scene, arm):
     np.testing.assert_allclose(result.position_error, errors[:, 0], atol=1e-5)
     np.testing.assert_allclose(result.rotation_error, errors[:, 1], atol=2e-3)
     assert np.all(result.qpos >= arm.lower[None]) and np.all(result.qpos <= arm.upper[None])
-    np.testing.assert_array_equal(result.qpos[:, 7:], present[:, 7:])  # the fingers stay
+    np.testing.assert_array_equal(result.qpos[:, 7:], present[:, 7:])  # the fingers do not move
 
 
 def test_ik_solves_another_arm(tmp_path):
@@ -118,21 +120,21 @@ def test_ik_solves_six_axes():
     assert np.all(_errors(scene, result.qpos, np.asarray(poses.as_matrix()))[solved, 0] < 1.001e-3)
 
 
-def test_the_redundancy_keeps_the_arm_near_and_off_its_limits(arm):
-    def apart(config):
+def test_nullspace_steps_bring_the_arm_near_and_off_its_limits(arm):
+    def travel_and_share_at_limits(config):
         _, present, result = _solve_all_lwr(config)
         solved = np.asarray(result.is_converged)
         joints, lower, upper = (np.asarray(x)[..., :7] for x in (result.qpos, arm.lower, arm.upper))
         margin = np.minimum(joints - lower, upper - joints).min(axis=-1)
         return np.linalg.norm(result.qpos - present, axis=1)[solved].mean(), np.mean(margin[solved] < 1e-4)
 
-    travel, at_limits = apart(dataclasses.replace(CONFIG, num_nullspace_steps=0))
-    less_travel, less_at_limits = apart(CONFIG)
+    travel, at_limits = travel_and_share_at_limits(dataclasses.replace(CONFIG, num_nullspace_steps=0))
+    less_travel, less_at_limits = travel_and_share_at_limits(CONFIG)
     assert less_travel < travel
     assert less_at_limits < at_limits
 
 
-def test_a_free_roll_asks_for_the_optical_axis_alone(scene):
+def test_a_free_roll_aligns_only_the_optical_axis(scene):
     config = dataclasses.replace(CONFIG, is_roll_free=True)
     poses, present, result = _solve_all_lwr(config)
     _, _, fixed = _solve_all_lwr(CONFIG)
@@ -150,7 +152,7 @@ def test_a_free_roll_asks_for_the_optical_axis_alone(scene):
     assert near < 0.9 * far
 
 
-def test_ik_keeps_joints_that_solve_already_and_prefers_the_nearest(arm):
+def test_ik_from_starts_returns_the_solution_nearest_to_the_present_joints(arm):
     start = jnp.asarray([0.2, 0.6, -0.3, 1.1, 0.4, -0.7, 0.5, 0.01, 0.03])
     pose = camera_pose(arm, forward_kinematics(arm, start))
     far = jnp.asarray([-2.9, -0.6, 2.8, -1.1, -2.7, 0.7, -2.6, 0.01, 0.03])
@@ -158,17 +160,17 @@ def test_ik_keeps_joints_that_solve_already_and_prefers_the_nearest(arm):
     np.testing.assert_allclose(result.qpos, start, atol=1e-3)
 
 
-def test_rank_puts_valid_before_converged_before_the_rest():
+def test_ranking_cost_orders_valid_then_converged_then_others():
     error = jnp.asarray([0.0, 0.0, 0.0, 0.2, 0.1, jnp.nan])
     is_converged = jnp.asarray([True, True, True, False, False, False])
     status = jnp.zeros(6, jnp.int32)
     results = IKResult(jnp.zeros((6, 9)), error, error, is_converged, status)
     is_valid = jnp.asarray([False, True, True, False, False, False])
     travel = jnp.asarray([0.0, 2.0, 1.0, 0.0, 3.0, 0.0])
-    np.testing.assert_array_equal(jnp.argsort(rank(results, is_valid, travel)), [2, 1, 0, 4, 3, 5])
+    np.testing.assert_array_equal(jnp.argsort(ranking_cost(results, is_valid, travel)), [2, 1, 0, 4, 3, 5])
 
 
-def test_ik_never_fails_loudly(arm):
+def test_unsolvable_poses_and_nan_joints_give_a_status_and_finite_joints(arm):
     solve = jax.jit(lambda pose, q: ik(arm, pose, q, dataclasses.replace(CONFIG, num_seeds=2)))
     far = SE3.from_translation(jnp.asarray([5.0, 0.0, 0.0]))
     nan = SE3.from_translation(jnp.asarray([jnp.nan, 0.0, 0.0]))
@@ -181,7 +183,7 @@ def test_ik_never_fails_loudly(arm):
         assert np.all(result.qpos >= arm.lower) and np.all(result.qpos <= arm.upper)
 
 
-def test_map_agrees_with_the_reach_of_shoulder_and_wrist(scene, reach, sphere):
+def test_map_equals_the_reach_from_shoulder_to_wrist(scene, reach, sphere):
     center, radius = sphere
     elevations = np.asarray(reach.elevations)
     tool = 0.078 + 0.3
@@ -192,11 +194,11 @@ def test_map_agrees_with_the_reach_of_shoulder_and_wrist(scene, reach, sphere):
     np.testing.assert_array_equal(reach.is_reachable, np.broadcast_to(is_within, reach.is_reachable.shape))
 
 
-def test_band_of_the_default_mount_is_the_one_of_the_thesis(reach):
+def test_band_of_the_default_mount_is_that_of_the_thesis(reach):
     np.testing.assert_allclose(np.rad2deg(reach.band), [40.0, 70.0], atol=1e-3)
 
 
-def test_reachable_cells_hold_up_in_mujoco(scene, reach, sphere):
+def test_reachable_cells_are_solved_and_free_in_mujoco(scene, reach, sphere):
     views = View(*(grid.ravel() for grid in jnp.meshgrid(reach.azimuths, reach.elevations, indexing="ij")))
     poses = np.asarray(jax.vmap(lambda view: view_pose(view, *sphere).as_matrix())(views))
     is_reachable = np.asarray(reach.is_reachable).ravel()
@@ -212,7 +214,7 @@ def test_reachable_cells_hold_up_in_mujoco(scene, reach, sphere):
     assert np.all(np.isfinite(qpos))
 
 
-def test_views_of_the_band_are_found_from_any_other_and_none_beyond(arm, reach, sphere):
+def test_every_view_of_the_band_is_solved_from_any_other_and_none_outside(arm, reach, sphere):
     random = np.random.default_rng(3)
     count = 128
     azimuth = jnp.asarray(random.uniform(-np.pi, np.pi, count), jnp.float32)
@@ -221,8 +223,8 @@ def test_views_of_the_band_are_found_from_any_other_and_none_beyond(arm, reach, 
     solve = jax.jit(jax.vmap(lambda a, e, q: solve_view(arm, reach, View(a, e), q, sphere, CONFIG)))
     result, is_reachable = solve(azimuth, elevation, present)
     assert np.all(is_reachable) and np.all(result.is_converged)
-    for beyond in (30.0, 78.0):
-        _, is_reachable = solve(azimuth, jnp.full_like(elevation, np.deg2rad(beyond)), present)
+    for outside in (30.0, 78.0):
+        _, is_reachable = solve(azimuth, jnp.full_like(elevation, np.deg2rad(outside)), present)
         assert not np.any(is_reachable)
 
 
@@ -233,6 +235,6 @@ def test_nearest_cell_wraps_around_and_skips_unreachable_cells(reach):
 
 
 def test_an_arm_that_reaches_nothing_has_no_band(sphere):
-    reach = _map(build_arm(build_scene(SceneConfig(mount_height=3.0))), *sphere)
+    reach = _compute_map(build_arm(build_scene(SceneConfig(mount_height=3.0))), *sphere)
     assert not np.any(reach.is_reachable)
     assert np.all(np.isnan(reach.band))

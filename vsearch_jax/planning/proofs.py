@@ -1,16 +1,18 @@
-"""What proves that nothing touches between two samples of a straight joint path.
+"""Proof that nothing touches between two samples of a straight joint path.
 
-A distance changes by no more than the way that the solids move against one another. So two samples prove all between
-them free where, for every pair, their distances add up to more than that way. Two bounds of it are known:
+A distance between two bodies changes by at most the distance that they move. So two samples prove that everything
+between them is free if, for every pair, the sum of their two distances is larger than that motion. Two bounds of the
+motion are used:
 
-- The joints' changes times the pair's levers (`Pairs.levers`), which holds between any two configurations.
-- Where one of the pair stands still: the chord between the two places of the other one, and how far the arc may stray
-  from it. A point whose second derivative along the edge is at most c strays by c t^2 / 8 over a share t of the edge.
+- The joints' changes times the pair's levers (`Pairs.levers`). It holds between any two configurations.
+- For a pair of which one body does not move: the chord between the two positions of the moving body, plus the largest
+  distance of the arc from the chord. A point whose second derivative along the edge is at most c leaves the chord by
+  at most c t^2 / 8 over a share t of the edge.
 
-Above the table only the height counts, which lies between those of the ends of the chord. Far from everything a few
-samples do for a whole edge.
+For the table only heights count. A height between two samples is at least the lower of the two, less that distance from
+the chord. Far from everything, a few samples prove a whole edge.
 
-All functions take arrays with a batch axis more at the end, too; see `batches.batch_axis_last`.
+All functions also accept arrays with a batch axis at the end; see `xla.batching.batch_axis_last`.
 """
 
 from __future__ import annotations
@@ -27,83 +29,112 @@ from vsearch_jax.robot.collision import Axes, Pairs, primitives
 from vsearch_jax.xla.batching import append_axes
 from vsearch_jax.xla.materialize import materialize, runtime_zero
 
-# m, of positions in float32.
+# Rounding error in m of positions in float32.
 ROUNDING = 1e-5
 
 
-class Sample(NamedTuple):
-    """Where the arm is at one configuration; N pairs, C capsules.
+class EdgeSample(NamedTuple):
+    """Distances and capsules of the arm at one configuration. N pairs of geoms that must not touch, C capsules.
 
     Attributes:
-      gap: f32[N] m, distances of the planning pairs, the table's less its clearance, or less than that.
-      axes: Axes of the capsules.
+      gap: f32[N] m, a lower bound of the distance of each pair. For pairs with the table, the table's clearance is
+        subtracted.
+      axes: Axes of the capsules in world.
     """
 
     gap: Array
     axes: Axes
 
 
-class Bounds(NamedTuple):
-    """What an edge can do at most, the whole of it; N pairs, C capsules.
+class EdgeBounds(NamedTuple):
+    """Upper bounds for a whole edge (straight joint path). N pairs of geoms that must not touch, C capsules.
 
     Attributes:
-      rate: f32[N] m, by which the motion shortens the distances.
-      bend: f32[C] m, second derivative of any point of a capsule.
+      rate: f32[N] m, by which the edge's motion changes each distance.
+      bend: f32[C] m, second derivative of the position of any point of a capsule by the share of the edge.
     """
 
     rate: Array
     bend: Array
 
 
-def look(arm: Arm, qpos: Array) -> Sample:
-    """Returns where the arm is at `qpos` (f32[nq])."""
+def evaluate_sample(arm: Arm, qpos: Array) -> EdgeSample:
+    """Computes the distances of all planning pairs and the axes of all capsules at one configuration.
+
+    Args:
+      arm: the arm.
+      qpos: f32[nq] rad or m, values of all joints.
+
+    Returns:
+      The distances and the axes.
+    """
     zero = runtime_zero(qpos)
-    # Else what follows computes this anew, the axes for every pair.
+    # Without the two boundaries XLA computes the frames and the axes again for every pair.
     rotations, positions, _, _ = kinematics.frames(arm.joints, materialize(qpos[arm.joints.address], zero))
     pairs = arm.planning_pairs
     axes = materialize(collision.capsule_axes(pairs, rotations, positions), zero)
     gap = collision.distances_from_axes(pairs, axes, arm.table_height)
     margin = jnp.where(pairs.part == collision.TABLE, arm.table_clearance, 0.0)
-    return Sample(gap - append_axes(margin, qpos.ndim - 1), axes)
+    return EdgeSample(gap - append_axes(margin, qpos.ndim - 1), axes)
 
 
-def motion_bounds(pairs: Pairs, change: Array) -> Bounds:
-    """Returns the bounds of the edge on which the joints of the chain change by `change` (f32[J] rad or m)."""
-    wide = functools.partial(append_axes, count=change.ndim - 1)
-    turns = jnp.abs(change)
-    before = jnp.cumsum(turns, axis=0) - turns
-    # Joint k, turning by w_k, gives a point the speed w_k r_k; it turns that itself, every joint before it twice.
-    bend = jnp.sum(wide(pairs.reach) * (turns * (turns + 2.0 * before))[None], axis=1)
-    return Bounds(jnp.sum(wide(pairs.levers) * turns[None], axis=1), bend)
-
-
-def ways(before: Axes, after: Axes) -> tuple[Array, Array]:
-    """Returns how far in m the capsules have moved, f32[C], and how far downward, f32[C]."""
-    middle, end = (
-        primitives.subtract(after.center, before.center),
-        primitives.subtract(after.half_axis, before.half_axis),
-    )
-    one = jnp.ones_like(middle[0])
-    moves = [primitives.add_scaled(middle, sign * one, end) for sign in (1.0, -1.0)]
-    way = jnp.maximum(*(primitives.length(move) for move in moves))
-    return way, jnp.maximum(-jnp.minimum(*(move[2] for move in moves)), 0.0)
-
-
-def is_free_between(pairs: Pairs, ends: tuple[Sample, Sample], step: Array, bounds: Bounds, way: Array) -> Array:
-    """Returns bool[]: nothing touches between two samples of an edge.
+def edge_bounds(pairs: Pairs, change: Array) -> EdgeBounds:
+    """Bounds how far an edge (straight joint path) can change the distances and bend the paths of the capsules.
 
     Args:
-      pairs: the planning pairs.
-      ends: the samples.
-      step: f32[], the share of the edge between them.
-      bounds: of the edge.
-      way: f32[C] m, how far the capsules have moved from one to the other.
+      pairs: the pairs of geoms that planning checks for contact.
+      change: f32[J] rad or m, change of the J joints that move the camera from the edge's start to its end.
+
+    Returns:
+      Upper bounds for the whole edge.
     """
-    wide = functools.partial(append_axes, count=step.ndim)
+    with_batch_axes = functools.partial(append_axes, count=change.ndim - 1)
+    turns = jnp.abs(change)
+    before = jnp.cumsum(turns, axis=0) - turns
+    # Joint k at speed w_k gives a point a velocity of at most w_k r_k. In the second derivative this velocity counts
+    # once with w_k, and twice with the speed of each joint before joint k.
+    bend = jnp.sum(with_batch_axes(pairs.reach) * (turns * (turns + 2.0 * before))[None], axis=1)
+    return EdgeBounds(jnp.sum(with_batch_axes(pairs.levers) * turns[None], axis=1), bend)
+
+
+def displacements(before: Axes, after: Axes) -> tuple[Array, Array]:
+    """Returns how far C capsules move from one configuration to another, in total and downward.
+
+    Args:
+      before: axes of the C capsules in world at the first configuration.
+      after: axes of the same capsules at the second configuration.
+
+    Returns:
+      Distance that each capsule moves, f32[C] m: the larger one of its axis's two ends. Distance that it moves
+      downward, f32[C] m, 0 or more: also the larger one of the two ends.
+    """
+    center = primitives.subtract(after.center, before.center)
+    half_axis = primitives.subtract(after.half_axis, before.half_axis)
+    one = jnp.ones_like(center[0])
+    moves = [primitives.add_scaled(center, sign * one, half_axis) for sign in (1.0, -1.0)]
+    distance = jnp.maximum(*(primitives.length(move) for move in moves))
+    return distance, jnp.maximum(-jnp.minimum(*(move[2] for move in moves)), 0.0)
+
+
+def is_free_between(
+    pairs: Pairs, ends: tuple[EdgeSample, EdgeSample], step: Array, bounds: EdgeBounds, distance: Array
+) -> Array:
+    """Returns bool[]: the two ends of a step prove that nothing touches between them.
+
+    A step is a part of an edge (straight joint path).
+
+    Args:
+      pairs: the pairs of geoms that planning checks for contact.
+      ends: distances and capsules at the two ends of the step.
+      step: f32[], length of the step as a share of the edge.
+      bounds: upper bounds of the motion on the whole edge, from `edge_bounds`.
+      distance: f32[C] m, how far each of the C capsules moves from one end to the other; see `displacements`.
+    """
+    with_batch_axes = functools.partial(append_axes, count=step.ndim)
     gap, step = ends[0].gap + ends[1].gap, step[None]
     by_levers = gap >= bounds.rate * step + ROUNDING
-    stray = (bounds.bend * step * step)[pairs.mover]
-    by_chord = gap >= way[pairs.mover] + 0.25 * stray + ROUNDING
-    by_height = jnp.minimum(ends[0].gap, ends[1].gap) >= 0.125 * stray + ROUNDING
-    by_place = jnp.where(wide(pairs.part == collision.TABLE), by_height, by_chord)
-    return jnp.all(by_levers | (wide(pairs.is_still) & by_place), axis=0)
+    bend = (bounds.bend * step * step)[pairs.mover]
+    by_chord = gap >= distance[pairs.mover] + 0.25 * bend + ROUNDING
+    by_height = jnp.minimum(ends[0].gap, ends[1].gap) >= 0.125 * bend + ROUNDING
+    by_position = jnp.where(with_batch_axes(pairs.part == collision.TABLE), by_height, by_chord)
+    return jnp.all(by_levers | (with_batch_axes(pairs.is_still) & by_position), axis=0)
