@@ -1,4 +1,6 @@
-"""Draws what the wrist camera sees around every object of the package: `python eval/views.py docs/views.png`."""
+"""Draws every object of the package as the wrist camera sees it: `python eval/views.py docs/views.png`."""
+
+from __future__ import annotations
 
 import dataclasses
 import sys
@@ -16,26 +18,27 @@ from vsearch_jax.types import View
 AZIMUTHS_DEG = np.arange(0, 360, 45)
 
 
-def views(name: str) -> np.ndarray:
-    """Returns f32[8, H, W, 3]: the object from eight sides, from the middle of what the arm can reach."""
+def wrist_images(name: str) -> np.ndarray:
+    """Returns f32[8, H, W, 3], images of one object at eight azimuths, at the middle elevation of the arm's band."""
     config = vs.Config.preset("cpu")
     env = vs.ViewSearchEnv(dataclasses.replace(config, scene=dataclasses.replace(config.scene, object=name)))
     elevation = jnp.mean(env.reach.band)
 
-    def picture(azimuth: jax.Array) -> jax.Array:
+    def wrist_image(azimuth: jax.Array) -> jax.Array:
         qpos, _ = env.solve_joints(View(azimuth, elevation), env.arm.home)
         return env.wrist_image(qpos)[1].rgb
 
-    return np.asarray(jax.jit(jax.vmap(picture))(jnp.deg2rad(AZIMUTHS_DEG.astype(np.float32))))
+    return np.asarray(jax.jit(jax.vmap(wrist_image))(jnp.deg2rad(AZIMUTHS_DEG.astype(np.float32))))
 
 
 def main(path: str) -> None:
-    """Writes the picture to `path`."""
+    """Writes the picture to `path`: one row for each object, one column for each azimuth."""
     names = available("objects")
-    figure = Figure(figsize=(len(AZIMUTHS_DEG), len(names)), dpi=128)
+    num_columns, num_rows = len(AZIMUTHS_DEG), len(names)
+    figure = Figure(figsize=(num_columns, num_rows), dpi=128)
     for row, name in enumerate(names):
-        for column, image in enumerate(views(name)):
-            axes = figure.add_axes((column / len(AZIMUTHS_DEG), 1 - (row + 1) / len(names), 1 / 8, 1 / len(names)))
+        for column, image in enumerate(wrist_images(name)):
+            axes = figure.add_axes((column / num_columns, 1 - (row + 1) / num_rows, 1 / num_columns, 1 / num_rows))
             axes.imshow(np.clip(image, 0, 1))
             axes.set_axis_off()
     Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -43,4 +46,6 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python eval/views.py PICTURE, for example docs/views.png")
     main(sys.argv[1])

@@ -1,4 +1,4 @@
-"""Draws a camera of any MJCF: `python examples/render_mjcf.py examples/workshop.xml room docs/workshop.png`."""
+"""Renders a camera of any MJCF file: `python examples/render_mjcf.py examples/workshop.xml room docs/workshop.png`."""
 
 import sys
 
@@ -11,7 +11,13 @@ from vsearch_jax import render
 
 
 def main(mjcf: str, camera: str, picture: str) -> None:
-    """Draws what the camera of that name sees in the model's initial pose."""
+    """Renders the model in its initial pose.
+
+    Args:
+      mjcf: path of the MJCF file.
+      camera: name of a camera of the model.
+      picture: path of the image file to write.
+    """
     model = mujoco.MjModel.from_xml_path(mjcf)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -22,4 +28,6 @@ def main(mjcf: str, camera: str, picture: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit("usage: python examples/render_mjcf.py MJCF CAMERA PICTURE")
     main(*sys.argv[1:])

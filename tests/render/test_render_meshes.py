@@ -1,3 +1,5 @@
+"""Meshes and height fields: images, normals, shadows and derivatives."""
+
 from __future__ import annotations
 
 import jax
@@ -11,11 +13,12 @@ from mujoco import mjtGeom, mjtLightType
 
 from oracles.render import (
     cast_image,
+    cast_points,
     forward,
     on_outline,
     pixel_directions,
     poses,
-    potato,
+    random_closed_mesh,
     random_scene,
     reached_by_light,
 )
@@ -27,8 +30,8 @@ SIZE = (48, 64)
 _render = jax.jit(render.render, static_argnames="size")
 
 
-def _potato_model(num_faces: int | None = None, light: str = "") -> mujoco.MjModel:
-    vertices, faces = potato(np.random.default_rng(5), 14)
+def _mesh_model(num_faces: int | None = None, light: str = "") -> mujoco.MjModel:
+    vertices, faces = random_closed_mesh(np.random.default_rng(5), 14)
     vertices = 3.0 * vertices
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{light}</worldbody></mujoco>")
     shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
@@ -39,24 +42,23 @@ def _potato_model(num_faces: int | None = None, light: str = "") -> mujoco.MjMod
     return spec.compile()
 
 
-def _draw(model: mujoco.MjModel, data: mujoco.MjData, scene: render.RenderScene | None = None):
+def _draw(model: mujoco.MjModel, data: mujoco.MjData) -> render.Image:
     frames = poses(model, data)
-    scene = render.compile_scene(model) if scene is None else scene
-    return _render(scene, frames, render.camera(frames, model, "eye"), size=SIZE)
+    return _render(render.compile_scene(model), frames, render.camera(frames, model, "eye"), size=SIZE)
 
 
-def test_closed_and_open_meshes_are_told_apart() -> None:
+def test_closed_and_open_meshes_are_distinguished() -> None:
     def is_closed(model: mujoco.MjModel) -> float:
         triangles = compile_triangles(model, np.flatnonzero(model.geom_type == mjtGeom.mjGEOM_MESH))
         assert triangles is not None
         return float(triangles.is_closed[0])
 
-    assert is_closed(_potato_model()) == 1.0
-    assert is_closed(_potato_model(num_faces=-1)) == 0.0
+    assert is_closed(_mesh_model()) == 1.0
+    assert is_closed(_mesh_model(num_faces=-1)) == 0.0
 
 
-def test_a_camera_inside_a_mesh_sees_its_wall() -> None:
-    model = _potato_model()
+def test_camera_inside_a_mesh_sees_its_wall() -> None:
+    model = _mesh_model()
     model.cam_pos[0] = [0.1, -0.05, 0.2]
     data = forward(model)
     depth, ids = cast_image(model, data, 0, SIZE)
@@ -66,13 +68,13 @@ def test_a_camera_inside_a_mesh_sees_its_wall() -> None:
     np.testing.assert_allclose(image.depth, depth, rtol=1e-5)
 
 
-def test_a_face_below_the_camera_and_behind_it_is_seen() -> None:
+def test_face_that_reaches_behind_the_camera_is_drawn() -> None:
     model = mujoco.MjModel.from_xml_string("""
       <mujoco><asset><mesh name="floor" inertia="shell" vertex="-9 -9 0  9 -9 0  9 9 0  -9 9 0  0 0 -1"
           face="0 1 2  0 2 3  0 4 1  1 4 2  2 4 3  3 4 0"/></asset>
       <worldbody><geom type="mesh" mesh="floor"/><camera name="eye" pos="0 0 .5" xyaxes="1 0 0 0 .3 1"/></worldbody>
       </mujoco>""")
-    model.geom_pos[:] += [0.01, 0.02, 0.0]  # else rays run along the diagonal
+    model.geom_pos[:] += [0.01, 0.02, 0.0]  # otherwise rays lie in the plane of the diagonal
     data = forward(model)
     depth, ids = cast_image(model, data, 0, SIZE)
     image = _draw(model, data)
@@ -82,17 +84,17 @@ def test_a_face_below_the_camera_and_behind_it_is_seen() -> None:
     np.testing.assert_allclose(np.asarray(image.depth)[is_same], depth[is_same], rtol=1e-4)
 
 
-def test_more_pairs_than_can_be_counted_are_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = _potato_model()
+def test_depth_is_nan_if_there_are_too_many_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = _mesh_model()
     data = forward(model)
     frames, scene = poses(model, data), render.compile_scene(model)
     eye = render.camera(frames, model, "eye")
-    monkeypatch.setattr(rasterizer, "_MOST_PAIRS", 100.0)
+    monkeypatch.setattr(rasterizer, "_MAX_PAIRS", 100.0)
     depth = jax.jit(lambda eye: render.render(scene, frames, eye, SIZE).depth)(eye)
     assert np.isnan(depth).all()
 
 
-def test_normals_are_those_of_mj_multi_ray() -> None:
+def test_normals_equal_mj_multi_ray() -> None:
     model = random_scene(np.random.default_rng(11))
     data = forward(model)
     _, ids = cast_image(model, data, 0, SIZE)
@@ -105,12 +107,12 @@ def test_normals_are_those_of_mj_multi_ray() -> None:
     image = _draw(model, data)
     is_clear = ~on_outline(ids) & (ids >= 0)
     error = np.linalg.norm(np.asarray(image.normal) - normals.reshape(*SIZE, 3), axis=-1)[is_clear]
-    assert np.quantile(error, 0.98) < 1e-3  # the rest are edges of boxes and cylinders
+    assert np.quantile(error, 0.98) < 1e-3  # the others are on edges of boxes and cylinders
     assert not np.asarray(image.normal)[ids < 0].any()
 
 
-def test_smooth_and_sharp_vertex_normals() -> None:
-    model = _potato_model()
+def test_vertex_normals_are_smooth_or_sharp() -> None:
+    model = _mesh_model()
     data = forward(model)
     normal = np.asarray(_draw(model, data).normal)
     _, ids = cast_image(model, data, 0, SIZE)
@@ -128,58 +130,54 @@ def test_smooth_and_sharp_vertex_normals() -> None:
 @pytest.mark.parametrize("light", [mjtLightType.mjLIGHT_DIRECTIONAL, mjtLightType.mjLIGHT_POINT], ids=lambda x: x.name)
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=6)
-def test_meshes_shade_other_geoms_as_rays_to_the_light_tell(light: mjtLightType, seed: int) -> None:
+def test_shadows_of_meshes_equal_mj_ray_towards_the_light(light: mjtLightType, seed: int) -> None:
     model = random_scene(np.random.default_rng(seed), num_geoms=5, light=light, num_meshes=5)
     data = forward(model)
     is_white = np.asarray(_draw(model, data).rgb)[..., 0] > 0.5
-    depth, ids = cast_image(model, data, 0, SIZE)
-    points = data.cam_xpos[0] + np.where(np.isfinite(depth), depth, 1.0)[..., None] * pixel_directions(
-        model, data, 0, SIZE
-    )
+    points, ids = cast_points(model, data, 0, SIZE)
     is_reached = reached_by_light(model, data, points, ids)
-    # mj_ray is told to pass over the body itself, which a mesh need not be convex for.
+    # mj_ray ignores the body of the pixel's geom. But a mesh that is not convex casts shadows on itself.
     is_face = np.isin(model.geom_type[ids], (mjtGeom.mjGEOM_MESH, mjtGeom.mjGEOM_HFIELD))
     is_clear = (ids >= 0) & ~is_face & ~on_outline(ids) & ~on_outline(is_reached)
     assert np.mean((is_white != is_reached)[is_clear]) < 2e-3
 
 
-def test_a_mesh_shades_itself() -> None:
+def test_mesh_casts_shadows_on_itself() -> None:
     light = '<light type="directional" dir="-1 .3 -.6" ambient="0 0 0" diffuse="1 1 1" specular="0 0 0"/>'
-    model = _potato_model(light=light)
+    model = _mesh_model(light=light)
     model.vis.headlight.active = 0
     data = forward(model)
-    image, toward = _draw(model, data), -data.light_xdir[0]
-    depth, ids = cast_image(model, data, 0, SIZE)
-    points = data.cam_xpos[0] + np.where(ids >= 0, depth, 1.0)[..., None] * pixel_directions(model, data, 0, SIZE)
+    image, to_light = _draw(model, data), -data.light_xdir[0]
+    points, ids = cast_points(model, data, 0, SIZE)
     normal = np.asarray(image.normal, np.float64)
     starts = points + 2e-3 * normal
     is_reached = np.ones(SIZE, bool)
     for pixel in zip(*np.nonzero(ids >= 0), strict=True):
-        is_reached[pixel] = mujoco.mj_ray(model, data, starts[pixel], toward, None, True, -1, None) < 0.0
-    is_turned = normal @ toward > 0.3
-    is_clear = (ids >= 0) & is_turned & ~on_outline(ids) & ~on_outline(is_reached)
+        is_reached[pixel] = mujoco.mj_ray(model, data, starts[pixel], to_light, None, True, -1, None) < 0.0
+    is_facing = normal @ to_light > 0.3
+    is_clear = (ids >= 0) & is_facing & ~on_outline(ids) & ~on_outline(is_reached)
     is_lit = np.asarray(image.rgb)[..., 0] > 0.1
     assert 0.02 < (~is_reached & is_clear).sum() / is_clear.sum() < 0.6
     assert np.mean((is_lit != is_reached)[is_clear]) < 0.02
 
 
-def test_gradients_of_meshes_equal_finite_differences() -> None:
-    model = _potato_model()
+def test_gradients_of_a_mesh_equal_central_differences() -> None:
+    model = _mesh_model()
     data = forward(model)
     frames, scene = poses(model, data), render.compile_scene(model)
-    eye, way = render.camera(frames, model, "eye"), jnp.array([0.3, -0.5, 0.8])
+    eye, direction = render.camera(frames, model, "eye"), jnp.array([0.3, -0.5, 0.8])
 
-    def picture(position: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def draw(position: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         image = render.render(scene, frames, eye.replace(position=position), size=(24, 24))
         return jnp.where(image.geom_id >= 0, image.depth, 0.0), image.rgb, image.geom_id
 
     step = 2e-3
-    pair = jax.jit(jax.vmap(picture))(eye.position[None] + step * jnp.array([[-1.0], [1.0]]) * way[None])
-    (_, _, ids), (depth_rate, rgb_rate, _) = jax.jit(lambda p: jax.jvp(picture, (p,), (way,)))(eye.position)
+    ends = jax.jit(jax.vmap(draw))(eye.position[None] + step * jnp.array([[-1.0], [1.0]]) * direction[None])
+    (_, _, ids), (depth_rate, rgb_rate, _) = jax.jit(lambda p: jax.jvp(draw, (p,), (direction,)))(eye.position)
     assert bool(jnp.all(jnp.isfinite(depth_rate))) and bool(jnp.all(jnp.isfinite(rgb_rate)))
     interior = ~on_outline(np.asarray(ids)) & (np.asarray(ids) >= 0)
-    for value, rate in ((pair[0], depth_rate), (pair[1], rgb_rate)):
+    for value, rate in ((ends[0], depth_rate), (ends[1], rgb_rate)):
         difference = np.asarray((value[1] - value[0]) / (2 * step))[interior]
         error = np.abs(np.asarray(rate)[interior] - difference)
-        # Where the ray goes over to the next face within the step, the quotient is a mean of both.
+        # If the ray moves to another face within the step, the difference is a mean of both faces.
         assert np.mean(error < 0.02 + 0.05 * np.abs(difference)) > 0.85

@@ -1,4 +1,4 @@
-"""A batched ray-caster for MuJoCo models in plain JAX: colour with cast shadows, depth, normals and geom numbers."""
+"""A batched ray caster for MuJoCo models in plain JAX: colour with shadows, depth, normals and geom ids."""
 
 from vsearch_jax.render.cameras import camera, camera_from_matrix, camera_from_pose
 from vsearch_jax.render.image import render, render_batch, silhouette, supersample

@@ -1,8 +1,8 @@
-"""What needs an outline rather than its inside: a silhouette with gradients, and a crop around an object."""
+"""Functions of an object's outline: a silhouette with derivatives, and a square crop."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,46 +11,40 @@ from jax import Array
 
 from vsearch_jax.render.cameras import pinhole, pixel_rays
 from vsearch_jax.render.image import render, silhouette
+from vsearch_jax.render.mj_poses import GeomPoses
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.types import Camera
 
-# How far around it, in pixels, a pixel looks for the outline.
-_REACH = 3
-
-
-def _moved(points: Array, geom: Array, data: Any, camera: Camera) -> Array:
-    """Returns f32[H, W, 3], in the camera's frame, `points` of it that move with their geoms and the camera."""
-    rotation, position = jnp.asarray(data.geom_xmat).reshape(-1, 3, 3)[geom], jnp.asarray(data.geom_xpos)[geom]
-    world = jax.lax.stop_gradient(points @ camera.rotation.T + camera.position[None, None])
-    fixed_rotation, fixed_position = jax.lax.stop_gradient((rotation, position))
-    local = jnp.einsum("hwji,hwj->hwi", fixed_rotation, world - fixed_position)
-    return (jnp.einsum("hwij,hwj->hwi", rotation, local) + position - camera.position[None, None]) @ camera.rotation
+# Radius in pixels within which a pixel searches for the outline.
+_SEARCH_RADIUS = 3
 
 
 def soft_silhouette(
     scene: RenderScene,
-    data: Any,
+    data: GeomPoses,
     camera: Camera,
     size: tuple[int, int],
     geom_ids: tuple[int, ...],
     softness: float = 0.7,
 ) -> Array:
-    """Returns how far each pixel is within the outline of some geoms, with derivatives that move the outline.
+    """Renders a differentiable silhouette of some geoms. Its derivatives follow the motion of the outline.
 
-    Where a surface turns away from the eye, its points and its outline move alike across the image, so the outline
-    follows the points seen next to it. That holds for what the geoms' poses and the camera do, and to first order.
-    Where something stands before the geoms, the edge of what is seen of them counts as theirs too.
+    The silhouette is a logistic function of the distance to the outline. The outline is taken to move with the visible
+    surface points next to it. At the rim of a curved surface, outline and surface points move alike in the image, so
+    this is exact to first order. Derivatives are with respect to the camera and the poses of the geoms. Where another
+    geom hides a part of the geoms, the border of the visible part counts as outline too.
 
     Args:
-      scene: RenderScene.
-      data: see `render`.
-      camera: Camera.
-      size: height and width in pixels, static.
-      geom_ids: MuJoCo's numbers of the geoms, static.
-      softness: pixels from the outline, 0.5, to 0.27 outside of it and 0.73 inside.
+      scene: shapes of the geoms, from `compile_scene`.
+      data: poses of the geoms, as for `render`.
+      camera: the camera in the world frame.
+      size: height H and width W of the image in pixels, static.
+      geom_ids: MuJoCo's numbers of the geoms in the silhouette, static.
+      softness: scale of the logistic function in pixels. The value is 0.5 on the outline, 0.27 at this distance
+        outside, and 0.73 at this distance inside.
 
     Returns:
-      f32[H, W]: 0 and 1 more than three pixels from the outline, a logistic function of the distance nearer to it.
+      Silhouette f32[H, W], 1 inside and 0 outside. Values between lie within 3 pixels of the outline.
     """
     image = jax.lax.stop_gradient(render(scene, data, camera, size))
     mask = silhouette(image, geom_ids)
@@ -58,31 +52,57 @@ def soft_silhouette(
     x, y = jax.lax.stop_gradient(pixel_rays(pixels, size))
     depth = jnp.where(mask, image.depth, 1.0)
     points = jnp.stack([x * depth, y * depth, -depth], axis=-1)
-    moved = _moved(points, jnp.maximum(image.geom_id, 0), data, camera)
+    moved = _attach_to_geoms(points, jnp.maximum(image.geom_id, 0), data, camera)
     away = jnp.maximum(-moved[..., 2], 1e-6)
     column = pixels.center_x + pixels.scale_x * moved[..., 0] / away
     row = pixels.center_y - pixels.scale_y * moved[..., 1] / away
-    # Where each point of the image has gone, a shift that is zero in value.
+    # The displacement of each point in the image. Its value is 0; only its derivatives count.
     shift = jnp.where(mask[..., None], jnp.stack([row, column], axis=-1), 0.0)
     shift = shift - jax.lax.stop_gradient(shift)
-    distance = _distance(mask, shift)
-    return jnp.where(jnp.abs(distance) > _REACH, mask.astype(jnp.float32), jax.nn.sigmoid(-distance / softness))
+    distance = _outline_distance(mask, shift)
+    is_far = jnp.abs(distance) > _SEARCH_RADIUS
+    return jnp.where(is_far, mask.astype(jnp.float32), jax.nn.sigmoid(-distance / softness))
 
 
-def _distance(mask: Array, shift: Array) -> Array:
-    """Returns f32[H, W], how far outside (above 0) or inside the outline a pixel is, up to `_REACH` + 1."""
+def _attach_to_geoms(points: Array, geom: Array, data: GeomPoses, camera: Camera) -> Array:
+    """Returns `points` unchanged, with derivatives as if each point were fixed to its geom.
+
+    Args:
+      points: f32[H, W, 3] m, in the camera's frame.
+      geom: i32[H, W], MuJoCo's geom number of each point.
+      data: poses.
+      camera: Camera.
+
+    Returns:
+      f32[H, W, 3] m, in the camera's frame.
+    """
+    rotation, position = jnp.asarray(data.geom_xmat).reshape(-1, 3, 3)[geom], jnp.asarray(data.geom_xpos)[geom]
+    world = jax.lax.stop_gradient(points @ camera.rotation.T + camera.position[None, None])
+    fixed_rotation, fixed_position = jax.lax.stop_gradient((rotation, position))
+    local = jnp.einsum("hwji,hwj->hwi", fixed_rotation, world - fixed_position)
+    return (jnp.einsum("hwij,hwj->hwi", rotation, local) + position - camera.position[None, None]) @ camera.rotation
+
+
+def _outline_distance(mask: Array, shift: Array) -> Array:
+    """Returns f32[H, W] pixels, the signed distance to the outline, negative inside, at most `_SEARCH_RADIUS` + 1.
+
+    Args:
+      mask: bool[H, W], the silhouette.
+      shift: f32[H, W, 2] pixels, displacement (row, column) of each point inside; its value is 0.
+    """
     height, width = mask.shape
-    pad = ((_REACH, _REACH), (_REACH, _REACH))
+    pad = ((_SEARCH_RADIUS, _SEARCH_RADIUS), (_SEARCH_RADIUS, _SEARCH_RADIUS))
     wide_mask, wide_shift = jnp.pad(mask, pad, mode="edge"), jnp.pad(shift, (*pad, (0, 0)))
-    best = jnp.full(mask.shape, _REACH + 1.0) * jnp.where(mask, -1.0, 1.0)
-    span = range(-_REACH, _REACH + 1)
-    for i, j in ((i, j) for i in span for j in span if 0 < i * i + j * j <= _REACH * _REACH):
+    best = jnp.full(mask.shape, _SEARCH_RADIUS + 1.0) * jnp.where(mask, -1.0, 1.0)
+    span = range(-_SEARCH_RADIUS, _SEARCH_RADIUS + 1)
+    for i, j in ((i, j) for i in span for j in span if 0 < i * i + j * j <= _SEARCH_RADIUS * _SEARCH_RADIUS):
         length = float(np.hypot(i, j))
-        other = (slice(_REACH + i, _REACH + i + height), slice(_REACH + j, _REACH + j + width))
-        # The outline is half a pixel beyond the last point that is seen; it moves with the point of the two within.
-        within = jnp.where(mask[..., None], shift, wide_shift[other])
-        along = (within[..., 0] * i + within[..., 1] * j) / length
-        # `along` points away from an inner pixel, towards the point of an outer one.
+        first_row, first_column = _SEARCH_RADIUS + i, _SEARCH_RADIUS + j
+        other = (slice(first_row, first_row + height), slice(first_column, first_column + width))
+        # The outline is half a pixel outside the inner one of the two pixels, and moves with it.
+        inner_shift = jnp.where(mask[..., None], shift, wide_shift[other])
+        along = (inner_shift[..., 0] * i + inner_shift[..., 1] * j) / length
+        # (i, j) points outwards if this pixel is the inner one, and inwards if it is the outer one.
         distance = jnp.where(mask, -(length - 0.5) - along, length - 0.5 + along)
         is_nearer = (wide_mask[other] != mask) & (length - 0.5 < jnp.abs(jax.lax.stop_gradient(best)))
         best = jnp.where(is_nearer, distance, best)
@@ -93,9 +113,9 @@ class Square(NamedTuple):
     """A square part of an image.
 
     Attributes:
-      row: f32[] pixels, of its centre.
-      column: f32[] pixels.
-      edge: f32[] pixels.
+      row: f32[] pixels, row of its centre, 0 at the upper edge of the image.
+      column: f32[] pixels, column of its centre, 0 at the left edge of the image.
+      edge: f32[] pixels, length of its edge.
     """
 
     row: Array
@@ -104,13 +124,16 @@ class Square(NamedTuple):
 
 
 def square_around(mask: Array, margin: float = 0.1) -> Square:
-    """Returns the square around what `mask` shows, `margin` of its edge wider on each side.
+    """Returns the square part of an image that holds all true pixels of a mask, for example an object's silhouette.
+
+    The square has the centre of the bounding box of the true pixels.
 
     Args:
-      mask: bool[H, W]; if it shows nothing, the square is the image's largest.
-      margin: part of the longer edge of the bounding box.
+      mask: bool[H, W], the image has H x W pixels. Without a true pixel, the result is the largest square in the middle
+        of the image.
+      margin: extra width on each side, as a fraction of the longer edge of the bounding box.
     """
-    (top, bottom), (left, right) = (_ends(jnp.any(mask, axis=axis)) for axis in (1, 0))
+    (top, bottom), (left, right) = (_extent(jnp.any(mask, axis=axis)) for axis in (1, 0))
     edge = jnp.maximum(bottom - top, right - left) * (1.0 + 2.0 * margin)
     is_seen, (height, width) = jnp.any(mask), mask.shape
     return Square(
@@ -120,14 +143,24 @@ def square_around(mask: Array, margin: float = 0.1) -> Square:
     )
 
 
-def _ends(is_there: Array) -> tuple[Array, Array]:
-    count = is_there.shape[0]
-    return jnp.argmax(is_there).astype(jnp.float32), (count - jnp.argmax(is_there[::-1])).astype(jnp.float32)
+def _extent(is_set: Array) -> tuple[Array, Array]:
+    """Returns f32[] each, the index of the first true entry and the index after the last, of bool[N]."""
+    count = is_set.shape[0]
+    return jnp.argmax(is_set).astype(jnp.float32), (count - jnp.argmax(is_set[::-1])).astype(jnp.float32)
 
 
-def crop(picture: Array, square: Square, size: int) -> Array:
-    """Returns f32[size, size, C], the part `square` of `picture` f32[H, W, C] resized; 0 beyond the picture's edges."""
+def crop(pixels: Array, square: Square, size: int) -> Array:
+    """Cuts a square part out of an image and resizes the part to `size` x `size` pixels with linear interpolation.
+
+    Args:
+      pixels: image f32[H, W, C] of H x W pixels and C channels.
+      square: the part to cut out. Beyond the edges of the image the result is 0.
+      size: number of rows and of columns of the result, static.
+
+    Returns:
+      Resized part, f32[size, size, C].
+    """
     scale = jnp.full(2, size / square.edge)
     corner = jnp.stack([square.row, square.column]) - 0.5 * square.edge
-    shape = (size, size, picture.shape[-1])
-    return jax.image.scale_and_translate(picture, shape, (0, 1), scale, -corner * scale, method="linear")
+    shape = (size, size, pixels.shape[-1])
+    return jax.image.scale_and_translate(pixels, shape, (0, 1), scale, -corner * scale, method="linear")

@@ -1,4 +1,4 @@
-"""What the renderer keeps of a MuJoCo model."""
+"""Compiles a MuJoCo model to a `RenderScene`: the shapes, materials and lights that the renderer draws."""
 
 from __future__ import annotations
 
@@ -15,39 +15,41 @@ from vsearch_jax.render.geometry.rays import RAY_FUNCTIONS
 from vsearch_jax.render.geometry.triangles import TRIANGLE_TYPES, Triangles, compile_triangles
 from vsearch_jax.render.texture.atlas import Textures, compile_textures, rgb_texture
 
-# What MuJoCo's renderer assumes of a geom without a material (mjv_initGeom) ...
+# Defaults of MuJoCo's renderer for a geom without a material (mjv_initGeom).
 _DEFAULT_SPECULAR, _DEFAULT_SHININESS = 0.5, 0.5
-# ... a colour with which a geom does not override its material's ...
+# MuJoCo's default colour. A geom with this colour takes the colour of its material.
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
-# ... the scale of shininess, and the ambient light of a model without any light (render_gl3.c).
+# Exponent of the highlight for shininess 1, and ambient light of a model without any light (render_gl3.c).
 _SHININESS_SCALE, _AMBIENT_WITHOUT_LIGHTS = 128.0, 0.3
 
-# Points from which shadow rays start are lifted by this part of the model's extent, far above f32's rounding.
+# Offset of a shadow ray from its surface, as a fraction of the model's extent. Far above the rounding error of f32.
 _SHADOW_OFFSET = 1e-4
 
 _LOG = logging.getLogger(__name__)
 
 
 class RenderError(ValueError):
-    """A model holds what the renderer cannot draw; the one-line message names it and says what to do."""
+    """The renderer cannot draw a model or cannot use an argument. The message names the cause and the remedy."""
 
 
 @flax.struct.dataclass
 class Lights:
-    """The active lights of a model, each in the frame of the body that carries it; L is their number.
+    """The L active lights of a model.
+
+    Positions and directions are in the frame of the body that carries the light.
 
     Attributes:
-      position: f32[L, 3] m; not used by directional lights.
-      direction: f32[L, 3] unit vector along which the light shines.
-      ambient: f32[L, 3], added to what the light reaches, whatever the surface's slope.
-      diffuse: f32[L, 3].
-      specular: f32[L, 3].
-      attenuation: f32[L, 3], constant, linear (1/m) and quadratic (1/m^2); not used by directional lights.
-      cutoff: f32[L] rad, half angle of a spot's cone.
-      exponent: f32[L], a spot's intensity falls off its axis with this power of the cosine.
-      is_directional: for each light; static.
-      is_shadowing: for each light; static.
-      bodies: for each light the body that carries it, 0 for one that is fixed in the world; static.
+      position: f32[L, 3] m, positions of the lights; not used by directional lights.
+      direction: f32[L, 3], unit vector along which the light shines.
+      ambient: f32[L, 3], light that does not depend on the angle of incidence.
+      diffuse: f32[L, 3], light that falls off with the cosine of the angle of incidence.
+      specular: f32[L, 3], light of the highlights.
+      attenuation: f32[L, 3], constant, linear (1/m) and quadratic (1/m^2) term; not used by directional lights.
+      cutoff: f32[L] rad, half angle of the cone of a spot light; pi for a point light.
+      exponent: f32[L], power of the cosine with which a spot light decreases off its axis; 0 for a point light.
+      is_directional: for each light, whether its rays are parallel; static.
+      is_shadowing: for each light, whether it casts shadows; static.
+      bodies: for each light, id of the body that carries it, 0 for a light fixed in the world; static.
     """
 
     position: Array
@@ -65,26 +67,27 @@ class Lights:
 
 @flax.struct.dataclass
 class RenderScene:
-    """Shapes, materials and lights; G is the number of visible geoms, in the order of `geom_ids`.
+    """Shapes, materials and lights that the renderer draws of a model. G is the number of visible geoms.
 
-    Arrays may be replaced inside jit (`scene.replace(rgb=...)`); what is static decides the compiled program.
+    Rows of the geoms have the order of `geom_ids`. Arrays may be replaced under jit with `dataclasses.replace`. Static
+    fields determine the compiled program.
 
     Attributes:
       size: f32[G, 3] m, MuJoCo's geom_size.
-      rgb: f32[G, 3] in [0, 1].
-      specular: f32[G] in [0, 1].
-      shininess: f32[G], exponent of the specular highlight (128 times MuJoCo's value).
-      emission: f32[G], light given off, in units of `rgb`.
-      triangles: the faces of meshes and height fields, or None without such geoms.
-      textures: of the geoms and the sky, or None without any.
-      lights: Lights.
-      headlight_ambient: f32[3], of the light that shines along the camera's axis.
-      headlight_diffuse: f32[3].
-      headlight_specular: f32[3].
-      ambient: f32[3], light from nowhere.
-      background: f32[3] in [0, 1], colour of a miss where the model has no skybox.
-      shadow_offset: f32[] m, how far shadow rays start off a surface.
-      geom_ids: MuJoCo's number of each visible geom; sorted by type, those made of triangles last; static.
+      rgb: f32[G, 3] in [0, 1], colours of the geoms.
+      specular: f32[G] in [0, 1], strength of the specular highlight.
+      shininess: f32[G], exponent of the specular highlight, 128 times MuJoCo's value.
+      emission: f32[G], emitted light as a factor of `rgb`.
+      triangles: Triangles of the meshes and height fields, or None without such geoms.
+      textures: Textures of the geoms and the sky, or None without any.
+      lights: the active lights; the headlight is apart.
+      headlight_ambient: f32[3]. The headlight is at the camera and shines along its axis.
+      headlight_diffuse: f32[3], diffuse light of the headlight.
+      headlight_specular: f32[3], light of its highlights.
+      ambient: f32[3], ambient light without a source.
+      background: f32[3] in [0, 1], colour of a miss if the model has no skybox.
+      shadow_offset: f32[] m, offset of a shadow ray from its surface.
+      geom_ids: MuJoCo's id of each visible geom, sorted by type, geoms made of triangles last; static.
       geom_types: mjtGeom of each visible geom; static.
       has_shadows: whether lights cast shadows; static.
     """
@@ -109,46 +112,37 @@ class RenderScene:
 
     @property
     def num_primitives(self) -> int:
-        """The number of geoms that are not made of triangles, which come first."""
+        """Number of visible geoms that are not made of triangles. Their rows come first in the scene's arrays."""
         return sum(kind not in TRIANGLE_TYPES for kind in self.geom_types)
 
 
 def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1, 2)) -> RenderScene:
-    """Returns the visible geoms, materials and lights of `mj_model`.
+    """Compiles the visible geoms, the materials and the lights of a model for `render`.
 
-    A geom is left out where its colour has alpha 0 or its group is not chosen; any other alpha counts as 1, with a
-    warning in the log, also that of textures. Of a material's textures that of the colour counts, of several
-    skyboxes the first.
+    A geom is invisible if its colour has alpha 0 or its group is not in `geom_groups`. Any other alpha is drawn as 1,
+    with a warning in the log. The alpha of textures is ignored. Of a material's textures only the colour texture is
+    drawn. Of several skyboxes the first is drawn.
 
     Args:
-      mj_model: the compiled model.
-      geom_groups: the geom groups that are drawn; MuJoCo's own renderer draws these by default.
+      mj_model: the compiled MuJoCo model.
+      geom_groups: MuJoCo's geom groups to draw. The default is that of MuJoCo's renderer.
+
+    Returns:
+      The scene that `render` draws.
 
     Raises:
-      RenderError: a visible geom is of a type or has a texture that is not supported, a light tracks a body or
-        is an image, the model has a visible skin or flex, or no geom is visible.
+      RenderError: no geom is visible; a visible geom has a type or a texture that is not supported; a light tracks a
+        body or is an image light; or a skin or flex is visible.
     """
-    rgba = _shown_rgba(mj_model)
-    groups = np.clip(mj_model.geom_group, 0, mujoco.mjNGROUP - 1)
-    visible = np.flatnonzero((rgba[:, 3] > 0.0) & np.isin(groups, geom_groups))
-    if visible.size == 0:
-        raise RenderError(
-            f"no geom of groups {geom_groups} is visible; choose other geom_groups or give a geom an alpha"
-        )
-    for geom in visible:
-        _check_geom(mj_model, int(geom))
-    faint = [mj_model.geom(g).name or f"number {g}" for g in visible.tolist() if rgba[g, 3] < 1.0]
-    if faint:
-        _LOG.warning("drawn as if they were opaque, though their colour is not: geoms %s", ", ".join(faint))
-    _check_soft(mj_model, geom_groups)
+    rgba = _effective_rgba(mj_model)
+    ids = _visible_geoms(mj_model, geom_groups, rgba[:, 3])
+    _check_skins_and_flexes(mj_model, geom_groups)
     for sky in np.flatnonzero(mj_model.tex_type == mjtTexture.mjTEXTURE_SKYBOX)[:1]:
         _check_texture(mj_model, int(sky), "the sky")
-    kinds = mj_model.geom_type[visible]
-    ids = visible[np.lexsort((kinds, np.isin(kinds, TRIANGLE_TYPES)))]
     lights = _compile_lights(mj_model)
     headlight = mj_model.vis.headlight
     is_headlight_on = float(headlight.active > 0)
-    is_dark = not headlight.active and not lights.is_directional
+    is_without_light = not headlight.active and not lights.is_directional
     return RenderScene(
         size=_f32(mj_model.geom_size[ids]),
         rgb=_f32(rgba[ids, :3]),
@@ -161,7 +155,7 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
         headlight_ambient=_f32(headlight.ambient * is_headlight_on),
         headlight_diffuse=_f32(headlight.diffuse * is_headlight_on),
         headlight_specular=_f32(headlight.specular * is_headlight_on),
-        ambient=_f32(np.full(3, _AMBIENT_WITHOUT_LIGHTS if is_dark else 0.0)),
+        ambient=_f32(np.full(3, _AMBIENT_WITHOUT_LIGHTS if is_without_light else 0.0)),
         background=jnp.zeros(3, dtype=jnp.float32),
         shadow_offset=_f32(_SHADOW_OFFSET * mj_model.stat.extent),
         geom_ids=tuple(int(i) for i in ids),
@@ -169,12 +163,29 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
     )
 
 
+def _visible_geoms(model: mujoco.MjModel, geom_groups: tuple[int, ...], alpha: np.ndarray) -> np.ndarray:
+    """Returns i64[G], the ids of the visible geoms in the order of `RenderScene.geom_ids`; checks each of them."""
+    groups = np.clip(model.geom_group, 0, mujoco.mjNGROUP - 1)
+    visible = np.flatnonzero((alpha > 0.0) & np.isin(groups, geom_groups))
+    if visible.size == 0:
+        raise RenderError(
+            f"no geom of the groups {geom_groups} is visible; pass other geom_groups, or give a geom an alpha above 0"
+        )
+    for geom in visible:
+        _check_geom(model, int(geom))
+    transparent = [model.geom(g).name or f"number {g}" for g in visible.tolist() if alpha[g] < 1.0]
+    if transparent:
+        _LOG.warning("these geoms have an alpha below 1 but are drawn opaque: %s", ", ".join(transparent))
+    kinds = model.geom_type[visible]
+    return visible[np.lexsort((kinds, np.isin(kinds, TRIANGLE_TYPES)))]
+
+
 def _f32(values: np.ndarray | float) -> Array:
     return jnp.asarray(values, dtype=jnp.float32)
 
 
-def _shown_rgba(model: mujoco.MjModel) -> np.ndarray:
-    """Returns f32[ngeom, 4]: the geom's colour where it is set or there is no material, else the material's."""
+def _effective_rgba(model: mujoco.MjModel) -> np.ndarray:
+    """Returns f32[ngeom, 4]: the material's colour if the geom has a material and the default colour, else its own."""
     rgba = np.array(model.geom_rgba)
     takes_material = (model.geom_matid >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=-1)
     rgba[takes_material] = model.mat_rgba[model.geom_matid[takes_material]]
@@ -182,7 +193,7 @@ def _shown_rgba(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _material_values(model: mujoco.MjModel, values: np.ndarray, default: float) -> np.ndarray:
-    """Returns f32[ngeom] of the materials' `values`, with `default` for geoms without a material."""
+    """Returns f32[ngeom], the entry of `values` of each geom's material, or `default` without a material."""
     return np.append(values, np.float32(default))[model.geom_matid]
 
 
@@ -192,37 +203,38 @@ def _check_geom(model: mujoco.MjModel, geom: int) -> None:
     if kind not in RAY_FUNCTIONS and kind not in TRIANGLE_TYPES:
         raise RenderError(
             f"{name} is of type {mjtGeom(kind).name}, which cannot be rendered; replace it by primitives or a mesh, "
-            "give it alpha 0 or leave out its group"
+            "give it alpha 0, or put it in a group that is not drawn"
         )
     texture = rgb_texture(model, geom)
     if texture >= 0:
         _check_texture(model, texture, name)
 
 
-def _check_texture(model: mujoco.MjModel, texture: int, wearer: str) -> None:
+def _check_texture(model: mujoco.MjModel, texture: int, owner: str) -> None:
     if model.tex_nchannel[texture] not in (3, 4):
         raise RenderError(
-            f"{wearer} has the texture {model.tex(texture).name!r} of {model.tex_nchannel[texture]} channels, "
-            "which cannot be rendered; give it three"
+            f"{owner} has the texture {model.tex(texture).name!r} with {model.tex_nchannel[texture]} channels, "
+            "which cannot be rendered; use a texture with 3 channels"
         )
 
 
-def _check_soft(model: mujoco.MjModel, groups: tuple[int, ...]) -> None:
-    for kind, shade, group in (
+def _check_skins_and_flexes(model: mujoco.MjModel, groups: tuple[int, ...]) -> None:
+    for kind, rgba, group in (
         (mjtObj.mjOBJ_SKIN, model.skin_rgba, model.skin_group),
         (mjtObj.mjOBJ_FLEX, model.flex_rgba, model.flex_group),
     ):
-        for number in range(len(shade)):
-            if shade[number, 3] > 0.0 and group[number] in groups:
+        for number in range(len(rgba)):
+            if rgba[number, 3] > 0.0 and group[number] in groups:
                 name = mujoco.mj_id2name(model, kind, number) or ""
-                word = kind.name.removeprefix("mjOBJ_").lower()
+                noun = kind.name.removeprefix("mjOBJ_").lower()
                 raise RenderError(
-                    f"{word} {name!r} (number {number}) cannot be rendered; give it alpha 0 or a group other than "
-                    f"{groups}, or replace it by a mesh"
+                    f"{noun} {name!r} (number {number}) cannot be rendered; replace it by a mesh, give it alpha 0, or "
+                    f"put it in a group other than {groups}"
                 )
 
 
 def _compile_lights(model: mujoco.MjModel) -> Lights:
+    """Returns the active lights; a light on a body that is welded to the world counts as fixed in the world."""
     active = np.flatnonzero(model.light_active)
     for light in active:
         _check_light(model, int(light))
@@ -250,7 +262,9 @@ def _compile_lights(model: mujoco.MjModel) -> Lights:
 def _check_light(model: mujoco.MjModel, light: int) -> None:
     name = f"light {model.light(light).name!r} (number {light})"
     if model.light_type[light] == mjtLightType.mjLIGHT_IMAGE:
-        raise RenderError(f"{name} is an image light, which cannot be rendered; use type directional, spot or point")
+        raise RenderError(
+            f"{name} is an image light, which cannot be rendered; use the type directional, spot or point"
+        )
     if model.light_mode[light] != mujoco.mjtCamLight.mjCAMLIGHT_FIXED:
         mode = mujoco.mjtCamLight(model.light_mode[light]).name
-        raise RenderError(f"{name} has mode {mode}, which cannot be rendered: give it mode fixed, in any body")
+        raise RenderError(f"{name} has the mode {mode}, which cannot be rendered; use the mode fixed, in any body")

@@ -1,8 +1,7 @@
-"""Which geom each pixel sees, and which pixels a light reaches.
+"""Finds the nearest primitive of each pixel, and the pixels that a light reaches.
 
-Both passes run through the geoms one by one, type by type, in loops that hold one small program a type. A loop visits
-only the geoms that can matter to the image, so its length is found at run time; under `vmap` it is that of the image
-with the most.
+Both passes loop over the geoms, type by type. Each type has one small loop body. A loop visits only the geoms that can
+affect the image, so its length is known at run time only. Under `vmap` the longest loop of the batch counts.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ from vsearch_jax.render.geometry.rays import CHORD_FUNCTIONS, RAY_FUNCTIONS
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.xla.vectors import Vector, dot
 
-_INFINITY_BITS = 0x7F800000
+_INFINITY_BITS = 0x7F800000  # bit pattern of +inf in f32
 
 
 class Frames(NamedTuple):
-    """Where the geoms are as the camera sees them; G is the number of visible geoms.
+    """Poses of the G visible geoms relative to the camera.
 
     Attributes:
       rotation: f32[G, 3, 3], camera to geom.
-      origin: f32[G, 3] m, the camera's position in the geom's frame.
-      center: f32[G, 3] m, the geom's position in the camera's frame.
-      radius: f32[G] m, of the sphere around `center` that holds the geom; +inf for planes.
+      origin: f32[G, 3] m, position of the camera in the geom's frame.
+      center: f32[G, 3] m, position of the geom in the camera's frame.
+      radius: f32[G] m, radius of the bounding sphere around `center`; +inf for planes.
     """
 
     rotation: Array
@@ -42,13 +41,14 @@ class Frames(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """The nearest geom of each pixel.
+    """The geom that each pixel of an H x W image shows: the nearest one on the pixel's ray.
 
     Attributes:
       slot: i32[H, W], row of the geom in the scene; 0 on a miss.
-      depth: f32[H, W] m; 1 on a miss. From `nearest` it is exact up to the bits that held the row.
-      is_hit: bool[H, W].
-      face: i32[H, W], the face that is hit, where it is one; 0 elsewhere.
+      depth: f32[H, W] m along the optical axis; 1 on a miss. `nearest_primitives` returns rough depths: their low bits
+        hold the row of the geom.
+      is_hit: bool[H, W], whether the pixel shows a geom.
+      face: i32[H, W], number of the face, if the geom is made of triangles; 0 otherwise.
     """
 
     slot: Array
@@ -58,13 +58,13 @@ class Hits(NamedTuple):
 
 
 def type_starts(scene: RenderScene) -> tuple[tuple[int, int], ...]:
-    """Returns each type of primitive of the scene with its first row."""
+    """Returns (mjtGeom, row of its first geom) for each geom type in the scene, without meshes and height fields."""
     kinds = scene.geom_types[: scene.num_primitives]
     return tuple((kind, kinds.index(kind)) for kind in sorted(set(kinds)))
 
 
 def bounding_radius(scene: RenderScene) -> Array:
-    """Returns f32[G] m: radii of spheres around the geoms; +inf for planes."""
+    """Returns the radii of bounding spheres around the G visible geoms' origins, f32[G] m; +inf for planes."""
     x, y, z = scene.size[:, 0], scene.size[:, 1], scene.size[:, 2]
     radii = {
         "mjGEOM_PLANE": jnp.full_like(x, jnp.inf),
@@ -81,24 +81,34 @@ def bounding_radius(scene: RenderScene) -> Array:
 
 
 def apply(rotation: Array, vector: Vector, offset: Array | None = None) -> Vector:
-    """Returns the triple `rotation @ vector + offset`; `rotation` f32[3, 3], `offset` f32[3]."""
+    """Rotates and shifts vectors that are stored as three arrays x, y, z: `rotation @ vector + offset`.
+
+    Args:
+      rotation: f32[3, 3].
+      vector: x, y and z of the vectors: three arrays of one shape, or of shapes that broadcast.
+      offset: f32[3], or None for zero.
+
+    Returns:
+      x, y and z of the results: three arrays.
+    """
     rows = [rotation[i, 0] * vector[0] + rotation[i, 1] * vector[1] + rotation[i, 2] * vector[2] for i in range(3)]
     if offset is not None:
         rows = [row + offset[i] for i, row in enumerate(rows)]
     return rows[0], rows[1], rows[2]
 
 
-def _triple(vector: Array) -> Vector:
-    return vector[0], vector[1], vector[2]
+def _as_vector(array: Array) -> Vector:
+    return array[0], array[1], array[2]
 
 
-def _is_left(rank: Array, state: tuple[Array, Array]) -> Array:
+def _has_next_geom(rank: Array, state: tuple[Array, Array]) -> Array:
     return state[0] < rank[-1]
 
 
-def _visit(
+def _visit_geom(
     value: Callable[[int, Array], Array], kind: int, start: int, rank: Array, state: tuple[Array, Array]
 ) -> tuple[Array, Array]:
+    """Takes the minimum with the next kept geom; the rank of a geom counts the kept geoms up to it."""
     count, best = state
     row = start + jnp.argmax(rank == count + 1)
     return count + 1, jnp.minimum(best, value(kind, row))
@@ -107,17 +117,17 @@ def _visit(
 def _minimum_over_geoms(
     scene: RenderScene, is_kept: Array, value: Callable[[int, Array], Array], initial: Array
 ) -> Array:
-    """Returns the pixelwise minimum of `initial` and `value(type, row)` over the rows where `is_kept`."""
+    """Returns the pixelwise minimum of `initial` and `value(type, row)` over the primitives where `is_kept`."""
     best = initial
     for (kind, start), (_, stop) in itertools.pairwise((*type_starts(scene), (-1, scene.num_primitives))):
         rank = jnp.cumsum(is_kept[start:stop])
-        visit = functools.partial(_visit, value, kind, start, rank)
-        _, best = jax.lax.while_loop(functools.partial(_is_left, rank), visit, (jnp.zeros_like(rank[0]), best))
+        visit = functools.partial(_visit_geom, value, kind, start, rank)
+        _, best = jax.lax.while_loop(functools.partial(_has_next_geom, rank), visit, (jnp.zeros_like(rank[0]), best))
     return best
 
 
-def _in_view(frames: Frames, x: Array, y: Array) -> Array:
-    """Returns bool[G]: the geom's bounding sphere reaches into the pyramid that the pixels see."""
+def _is_in_frustum(frames: Frames, x: Array, y: Array) -> Array:
+    """Returns bool[G]: the geom's bounding sphere intersects the view frustum of the pixels."""
     depth = -frames.center[:, 2]
     is_kept = depth > -frames.radius
     for axis, slopes in ((0, x), (1, y)):
@@ -127,45 +137,62 @@ def _in_view(frames: Frames, x: Array, y: Array) -> Array:
     return is_kept
 
 
-def nearest(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
-    """Returns the nearest primitive of each pixel.
+def nearest_primitives(scene: RenderScene, frames: Frames, x: Array, y: Array) -> Hits:
+    """Finds the primitive geom (not a mesh or height field) that each pixel of an H x W image shows.
 
-    The row number stands in the low bits of the depth's bit pattern. Bit patterns order as the depths do, so that one
-    minimum finds both. Surfaces nearer to one another than these bits tell, 1e-5 of their depth with 64 primitives and
-    1e-4 with 1,000, may be mistaken for one another.
+    The low bits of the depth hold the row of the geom. Bit patterns of positive floats have the order of the floats, so
+    one minimum finds depth and row. Two surfaces are confused if their depths differ by less than the lost bits: 1e-5
+    of the depth with 64 primitives, 1e-4 with 1,000.
 
     Args:
-      scene: shapes.
-      frames: Frames.
-      x: f32[1, W], slopes of the pixels' rays.
-      y: f32[H, 1].
+      scene: the compiled scene; the shapes are read.
+      frames: poses of the geoms relative to the camera.
+      x: f32[1, W], x of the directions (x, y, -1) of the pixels' rays, in the camera's frame.
+      y: f32[H, 1], y of these directions.
+
+    Returns:
+      Nearest primitive of each pixel, with a rough depth.
     """
     mask = (1 << max(1, (scene.num_primitives - 1).bit_length())) - 1
     ray = (x, y, -jnp.ones_like(x))
 
     def packed_depth(kind: int, row: Array) -> Array:
         direction = apply(frames.rotation[row], ray)
-        depth = RAY_FUNCTIONS[kind](_triple(scene.size[row]), _triple(frames.origin[row]), direction)
+        depth = RAY_FUNCTIONS[kind](_as_vector(scene.size[row]), _as_vector(frames.origin[row]), direction)
         return (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | row.astype(jnp.int32)
 
     initial = jnp.full((y.shape[0], x.shape[1]), _INFINITY_BITS, dtype=jnp.int32)
-    packed = _minimum_over_geoms(scene, _in_view(frames, x, y), packed_depth, initial)
+    packed = _minimum_over_geoms(scene, _is_in_frustum(frames, x, y), packed_depth, initial)
     is_hit = packed < _INFINITY_BITS
     depth = jax.lax.bitcast_convert_type(packed & ~mask, jnp.float32)
     slot = jnp.where(is_hit, packed & mask, 0)
     return Hits(slot, jnp.where(is_hit, depth, 1.0), is_hit, jnp.zeros_like(slot))
 
 
-def poses(frames: Frames, start: int) -> Array:
-    """Returns f32[12, G - start]: the poses of the geoms from row `start` on, as `raster.View` has them."""
+def pose_rows(frames: Frames, start: int) -> Array:
+    """Returns the poses of the scene's last geoms in the layout that the rasteriser of meshes and height fields reads.
+
+    Args:
+      frames: poses of the G visible geoms relative to the camera.
+      start: row of the first geom to return, static.
+
+    Returns:
+      f32[12, G - start]. A column holds the 3 x 4 matrix from the geom's frame to the camera's frame, row by row, in m.
+    """
     rotation = frames.rotation[start:].transpose(0, 2, 1)
     return jnp.concatenate([rotation, frames.center[start:, :, None]], axis=2).reshape(-1, 12).T
 
 
-def nearer(scene: RenderScene, hits: Hits, raster: Raster) -> Hits:
-    """Returns the hits with those faces of `raster` that are nearer."""
+def merge_raster(scene: RenderScene, hits: Hits, raster: Raster) -> Hits:
+    """Combines both passes of the renderer: keeps for each pixel the nearer of its primitive geom and its triangle.
+
+    Args:
+      scene: the compiled scene, with meshes or height fields.
+      hits: nearest primitive of each pixel.
+      raster: nearest triangle of each pixel. A triangle with a depth of NaN counts as nearer, so the NaN is visible.
+    """
     assert scene.triangles is not None
-    is_nearer = ~(raster.depth >= jnp.where(hits.is_hit, hits.depth, jnp.inf))  # also of NaN, which is to be seen
+    is_nearer = ~(raster.depth >= jnp.where(hits.is_hit, hits.depth, jnp.inf))
     geom = scene.triangles.geom.at[raster.face].get(mode="promise_in_bounds")
     return Hits(
         jnp.where(is_nearer, scene.num_primitives + geom, hits.slot),
@@ -183,55 +210,62 @@ def is_lit(
     light: Array,
     is_directional: bool,
 ) -> Array:
-    """Returns f32[H, W]: 0 where a geom stands between the pixel's surface and the light, else 1.
+    """Computes which pixels of an H x W image a light reaches. Only primitive geoms cast shadows here, not meshes.
 
-    A geom is convex, so it never shades the part of itself that faces the light: its own row is passed over, and a
-    surface needs no bias against itself. The light and what is seen lie outside of all other solids.
+    A primitive is convex, so it never casts a shadow on the part of itself that faces the light. Each pixel therefore
+    skips its own geom, and needs no bias against self-shadowing. Assumes that the light and the visible surfaces lie
+    outside all other solids.
 
     Args:
-      scene: shapes.
-      frames: Frames.
-      hits: Hits, with exact depths.
-      rays: slopes of the pixels' rays, f32[1, W] and f32[H, 1].
-      light: f32[3] in the camera's frame: m, where the light is, or for a directional light a unit vector towards it.
-      is_directional: static.
+      scene: the compiled scene; the shapes are read.
+      frames: poses of the geoms relative to the camera.
+      hits: geom that each pixel shows, with exact depth.
+      rays: x f32[1, W] and y f32[H, 1] of the directions (x, y, -1) of the pixels' rays, in the camera's frame.
+      light: f32[3] in the camera's frame: position of the light in m, or unit vector towards a directional light.
+      is_directional: whether the light is directional, static.
+
+    Returns:
+      f32[H, W], 0 where a primitive stands between the surface and the light, 1 elsewhere.
     """
     x, y = rays
     point = (x * hits.depth, y * hits.depth, -hits.depth)
-    # Rays run from the surface to a light at infinity, from any other light to the surface: what they share is computed
-    # once for all pixels.
+    # A ray runs from the surface to a directional light, but from any other light to the surface. What all rays share,
+    # the direction or the origin, is then computed only once.
     if is_directional:
-        start, way, low, high = point, _triple(light), scene.shadow_offset, jnp.full_like(hits.depth, jnp.inf)
+        start, direction, low, high = point, _as_vector(light), scene.shadow_offset, jnp.full_like(hits.depth, jnp.inf)
     else:
-        start, way = _triple(light), (point[0] - light[0], point[1] - light[1], point[2] - light[2])
-        low, high = 0.0, 1.0 - scene.shadow_offset / jnp.sqrt(jnp.maximum(dot(way, way), 1e-12))
+        start, direction = _as_vector(light), (point[0] - light[0], point[1] - light[1], point[2] - light[2])
+        low, high = 0.0, 1.0 - scene.shadow_offset / jnp.sqrt(jnp.maximum(dot(direction, direction), 1e-12))
 
-    def lit_past(kind: int, row: Array) -> Array:
+    def lit_behind(kind: int, row: Array) -> Array:
         local_start = apply(frames.rotation[row], start, frames.origin[row])
-        local_way = apply(frames.rotation[row], way)
-        chord = CHORD_FUNCTIONS[kind](_triple(scene.size[row]), local_start, local_way)
+        local_direction = apply(frames.rotation[row], direction)
+        chord = CHORD_FUNCTIONS[kind](_as_vector(scene.size[row]), local_start, local_direction)
         return jnp.where((chord > low) & (chord < high) & (hits.slot != row), 0.0, 1.0)
 
-    is_kept = _between(frames, hits, rays, light, is_directional)
-    return _minimum_over_geoms(scene, is_kept, lit_past, jnp.ones_like(hits.depth))
+    is_kept = _may_cast_shadow(frames, hits, rays, light, is_directional)
+    return _minimum_over_geoms(scene, is_kept, lit_behind, jnp.ones_like(hits.depth))
 
 
-def _between(frames: Frames, hits: Hits, rays: tuple[Array, Array], light: Array, is_directional: bool) -> Array:
-    """Returns bool[G]: the geom's bounding sphere reaches into the hull of all hit points and the light."""
+def _may_cast_shadow(
+    frames: Frames, hits: Hits, rays: tuple[Array, Array], light: Array, is_directional: bool
+) -> Array:
+    """Returns bool[G]: the geom's bounding sphere intersects a hull of all hit points and the light."""
     near = jnp.min(jnp.where(hits.is_hit, hits.depth, jnp.inf))
     far = jnp.max(jnp.where(hits.is_hit, hits.depth, -jnp.inf))
     near, far = jnp.where(near <= far, near, 1.0), jnp.where(near <= far, far, 1.0)
-    # The hit points lie in a frustum from `near` to `far`; a sphere around a point of its axis holds it.
+    # The hit points lie in a frustum between the depths `near` and `far`. A sphere around the middle of its axis bounds
+    # the frustum.
     middle = 0.5 * (near + far)
     x_middle, y_middle = (0.5 * (jnp.min(slopes) + jnp.max(slopes)) for slopes in rays)
     x_half, y_half = (0.5 * (jnp.max(slopes) - jnp.min(slopes)) for slopes in rays)
-    sphere = middle * jnp.stack([x_middle, y_middle, -jnp.ones_like(middle)])
+    center = middle * jnp.stack([x_middle, y_middle, -jnp.ones_like(middle)])
     axis_length = jnp.sqrt(1.0 + x_middle * x_middle + y_middle * y_middle)
-    reach = frames.radius + (far - middle) * axis_length + far * jnp.sqrt(x_half * x_half + y_half * y_half)
-    # The hull lies within that radius of the line from the sphere's middle to the light.
-    way = light if is_directional else light - sphere
-    offset = frames.center - sphere[None]
-    along = jnp.maximum(offset @ way / jnp.maximum(way @ way, 1e-20), 0.0)
+    limit = frames.radius + (far - middle) * axis_length + far * jnp.sqrt(x_half * x_half + y_half * y_half)
+    # The hull lies within the sphere's radius of the line from the sphere's centre to the light.
+    to_light = light if is_directional else light - center
+    offset = frames.center - center[None]
+    along = jnp.maximum(offset @ to_light / jnp.maximum(to_light @ to_light, 1e-20), 0.0)
     along = along if is_directional else jnp.minimum(along, 1.0)
-    gap = offset - along[:, None] * way[None]
-    return jnp.sum(gap * gap, axis=-1) <= reach * reach
+    gap = offset - along[:, None] * to_light[None]
+    return jnp.sum(gap * gap, axis=-1) <= limit * limit

@@ -71,17 +71,19 @@ _LEVEL_FUNCTIONS: dict[int, Callable[[Vector, Vector], ValueAndGradient]] = {
 
 
 def level(slot: Array, starts: tuple[tuple[int, int], ...], size: Vector, point: Vector) -> ValueAndGradient:
-    """Returns the level-set function of each pixel's geom, and its gradient, at a point on or near the surface.
+    """Evaluates for each pixel the level-set function F of the geom that the pixel shows, and the gradient of F.
+
+    F is 0 on the surface of the geom. The gradient of F is an outward normal. The image has H x W pixels.
 
     Args:
       slot: i32[H, W], row of each pixel's geom in the scene. Rows are sorted by geom type.
       starts: (mjtGeom, first row) of each geom type in the scene, sorted by row; see `trace.type_starts`. Static.
-      size: three f32[H, W] m, sizes of each pixel's geom.
-      point: three f32[H, W] m, in the frame of that geom.
+      size: three f32[H, W] m, MuJoCo's `geom_size` of each pixel's geom.
+      point: three f32[H, W] m, a point on or near the surface of each pixel's geom, in the frame of that geom.
 
     Returns:
-      F, f32[H, W], and its gradient, three f32[H, W], in the geom's frame. On an edge of a box the gradient is the sum
-      of the faces' gradients. Without primitives, F is 0 and the gradient is (0, 0, 1).
+      F, f32[H, W], and the gradient of F, three f32[H, W], in the geom's frame. On an edge of a box the gradient is the
+      sum of the faces' gradients. In a scene without primitives, F is 0 and the gradient is (0, 0, 1).
     """
     zero = jnp.zeros_like(point[0])
     result: ValueAndGradient = (zero, (zero, zero, zero + 1.0))
@@ -92,26 +94,26 @@ def level(slot: Array, starts: tuple[tuple[int, int], ...], size: Vector, point:
 
 
 def select(condition: Array, a: ValueAndGradient, b: ValueAndGradient) -> ValueAndGradient:
-    """Returns `a` where `condition` is true, and `b` elsewhere.
+    """Returns `a` where `condition` is true, else `b`. Both hold a value and a gradient for each of H x W pixels.
 
     Args:
       condition: bool[H, W].
-      a: f32[H, W] and three f32[H, W].
-      b: f32[H, W] and three f32[H, W].
+      a: value f32[H, W], and gradient as three f32[H, W].
+      b: value f32[H, W], and gradient as three f32[H, W].
     """
     x, y, z = (jnp.where(condition, i, j) for i, j in zip(a[1], b[1], strict=True))
     return jnp.where(condition, a[0], b[0]), (x, y, z)
 
 
 def affine(rows: list[Array], point: Vector) -> list[Array]:
-    """Returns the values a x + b y + c z + d of affine maps at `point` (x, y, z).
+    """Evaluates N affine functions a x + b y + c z + d at one point (x, y, z) for each of H x W pixels.
 
     Args:
-      rows: 4 N arrays f32[H, W]: a, b, c, d of the first map, then of the second, and so on.
-      point: three f32[H, W].
+      rows: 4 N arrays f32[H, W]: a, b, c, d of the first function, then of the second, and so on.
+      point: x, y and z of each pixel's point, three f32[H, W].
 
     Returns:
-      N arrays f32[H, W].
+      Values of the N functions, N arrays f32[H, W].
     """
     x, y, z = point
     return [a * x + b * y + c * z + d for a, b, c, d in zip(*(rows[i::4] for i in range(4)), strict=True)]

@@ -15,7 +15,7 @@ from vsearch_jax.xla.materialize import materialize
 
 
 class Pairs(NamedTuple):
-    """The rectangle of each face, and the numbers of its pairs.
+    """The pixel rectangle around each of T faces, and the numbers of the face's pairs (face, pixel of its rectangle).
 
     An interval of pixels is one i32: the low 16 bits hold the first pixel, the high 16 bits the last pixel plus 1.
 
@@ -33,26 +33,26 @@ class Pairs(NamedTuple):
 
 
 def count_pairs(columns: Array, rows: Array) -> Array:
-    """Returns i32[T], the number of pixels in the rectangle of each face.
+    """Returns the number of pixels in the rectangle of each of T faces, i32[T].
 
     Args:
-      columns: i32[T]; see `Pairs`.
-      rows: i32[T]; see `Pairs`.
+      columns: i32[T], columns of each rectangle: first column in the low 16 bits, last column plus 1 in the high 16.
+      rows: i32[T], rows of each rectangle, in the same form.
     """
     return ((columns >> 16) - (columns & 0xFFFF)) * ((rows >> 16) - (rows & 0xFFFF))
 
 
 def faces_of_pairs(pairs: Pairs, start: Array, batch_size: int, zero: Array) -> Array:
-    """Returns the faces of the pairs from number `start` on.
+    """Returns the face of each pair (face, pixel of its rectangle) in a batch of pairs with consecutive numbers.
 
     Args:
-      pairs: Pairs.
-      start: i32[].
-      batch_size: B, a multiple of 64; static.
-      zero: i32[], 0 at run time; see `vsearch_jax.xla.materialize`.
+      pairs: pixel rectangle of each face, and numbers of the pairs of each face.
+      start: i32[], number of the first pair of the batch.
+      batch_size: number of pairs B in the batch, a multiple of 64; static.
+      zero: i32[], a 0 that the compiler does not know to be 0. It keeps XLA from computing results twice.
 
     Returns:
-      i32[B]; for numbers after the last pair, the last face that begins before them.
+      Number of each pair's face, i32[B]. A number after the last pair gets the last face that begins before it.
     """
     marks = materialize(_mark_first_pairs(pairs, start, batch_size), zero)
     return materialize(_running_maximum(marks), zero)
@@ -79,11 +79,12 @@ def _running_maximum(values: Array) -> Array:
 
 
 def pixels_of_pairs(columns: Array, rows: Array, first: Array, number: Array) -> tuple[Array, Array]:
-    """Returns the row and the column of each pair's pixel, i32[B] each.
+    """Returns the image row and column of the pixel of each of B pairs (face, pixel of its rectangle), i32[B] each.
 
     Args:
-      columns: i32[B], columns of the rectangle of each pair's face; see `Pairs`.
-      rows: i32[B], rows of that rectangle.
+      columns: i32[B], columns of the rectangle of each pair's face: first column in the low 16 bits, last column plus 1
+        in the high 16 bits.
+      rows: i32[B], rows of that rectangle, in the same form.
       first: i32[B], number of the first pair of that face.
       number: i32[B], number of the pair.
     """

@@ -63,7 +63,7 @@ class Pinhole(NamedTuple):
 
 
 class Raster(NamedTuple):
-    """The nearest face of each pixel.
+    """The nearest triangle (face) in each of H x W pixels.
 
     Attributes:
       depth: f32[H, W] m along the view's axis, +inf on a miss.
@@ -75,7 +75,9 @@ class Raster(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """A view of the geoms along its -z axis, and its mapping onto pixels.
+    """How M geoms are drawn: the poses of the geoms in a view's frame, and the mapping from this frame to pixels.
+
+    The view looks along the -z axis of its frame.
 
     Attributes:
       pose: f32[12, M], row by row the 3 x 4 matrix from each geom's frame to the view's frame, in m.
@@ -232,16 +234,17 @@ def _test_batch(
 
 
 def rasterize(triangles: Triangles, projection: Projection, size: tuple[int, int], zero: Array) -> Raster:
-    """Returns the nearest face of each pixel.
+    """Draws triangles: returns for each pixel the nearest triangle (face) and its depth.
 
     Args:
-      triangles: Triangles.
-      projection: Projection of the geoms of `triangles`.
-      size: height and width in pixels, each at most 32,767; static.
-      zero: i32[], 0 at run time; see `vsearch_jax.xla.materialize`.
+      triangles: the faces of all geoms, each in the frame of its geom.
+      projection: poses of these geoms in the frame of the view, and the view's mapping onto pixels.
+      size: height and width of the image in pixels, each at most 32,767; static.
+      zero: i32[], a 0 that the compiler does not know to be 0. It keeps XLA from computing results twice.
 
     Returns:
-      Raster of that size. All its depths are NaN if there are more than about 2^31 pairs of face and pixel.
+      Nearest face and depth of each pixel. All depths are NaN if there are more than about 2^31 pairs of a face and a
+      pixel of the rectangle around the face.
     """
     columns, rows = _bounding_rectangles(triangles, projection, size, zero)
     count = count_pairs(columns, rows)

@@ -58,14 +58,14 @@ class Triangles:
 
 
 def compile_triangles(model: mujoco.MjModel, geoms: np.ndarray) -> Triangles | None:
-    """Returns the faces of meshes and height fields.
+    """Collects the faces of all meshes and height fields into one list of triangles for the renderer.
 
     Args:
-      model: the compiled model.
-      geoms: int[M], ids of geoms of type mesh or height field.
+      model: the compiled MuJoCo model.
+      geoms: int[M], ids of the M geoms of type mesh or height field that are drawn.
 
     Returns:
-      Triangles, with the geoms in the given order, or None if `geoms` is empty.
+      The triangles, with the geoms in the given order. None if `geoms` is empty.
     """
     if not len(geoms):
         return None

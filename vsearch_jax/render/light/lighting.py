@@ -22,10 +22,10 @@ from vsearch_jax.xla.vectors import Vector
 
 
 class LightPoses(NamedTuple):
-    """The lights in the camera's frame; L is their number.
+    """Poses of the L lights of a scene in the camera's frame.
 
     Attributes:
-      position: f32[L, 3] m.
+      position: f32[L, 3] m, positions of the lights.
       direction: f32[L, 3], unit vectors along which the lights shine.
     """
 
@@ -34,12 +34,12 @@ class LightPoses(NamedTuple):
 
 
 def light_poses(scene: RenderScene, data: GeomPoses, camera: Camera) -> LightPoses:
-    """Returns the poses of the scene's lights in the camera's frame.
+    """Returns the positions and directions of the scene's lights in the camera's frame.
 
     Args:
-      scene: RenderScene. Its lights are fixed in the world or in the frames of bodies.
-      data: poses in world. Only `xpos` and `xmat` are read, and only if a body carries a light.
-      camera: Camera.
+      scene: the compiled scene. Each light is fixed in the world or on a body.
+      data: poses of the bodies in world. Only `xpos` and `xmat` are read, and only if a body carries a light.
+      camera: the camera in the world frame.
     """
     positions, directions = [], []
     for index, body in enumerate(scene.lights.bodies):
@@ -67,24 +67,24 @@ def _light_source(scene: RenderScene, poses: LightPoses, index: int) -> tuple[Ar
 
 
 def needs_shadow_maps(scene: RenderScene) -> bool:
-    """Returns whether the scene has meshes or height fields and a light that casts shadows."""
+    """Returns whether a shadow map is needed: the scene has meshes or height fields, and a light that casts shadows."""
     return scene.triangles is not None and bool(_shadow_casters(scene))
 
 
 def shadow_maps(
     scene: RenderScene, frames: trace.Frames, poses: LightPoses, seen: tuple[Vector, Array], zero: Array
 ) -> dict[int, ShadowMap]:
-    """Returns the shadow maps of meshes and height fields.
+    """Draws a shadow map for each light that casts shadows. The maps hold the shadows of meshes and height fields.
 
     Args:
-      scene: RenderScene with triangles.
-      frames: Frames of the geoms.
-      poses: LightPoses.
-      seen: points that the camera sees, three f32[...] m in its frame, and bool[...], whether the pixel hits a geom.
-      zero: i32[], 0 at run time; see `vsearch_jax.xla.materialize`.
+      scene: the compiled scene, with meshes or height fields.
+      frames: poses of the geoms relative to the camera.
+      poses: poses of the lights in the camera's frame.
+      seen: point that each pixel sees, three f32[...] m in the camera's frame; and bool[...], whether there is one.
+      zero: i32[], a 0 that the compiler does not know to be 0. It keeps XLA from computing results twice.
 
     Returns:
-      A ShadowMap for each light that casts shadows, by the light's row.
+      {number of the light in the scene: its shadow map}.
     """
     return {
         i: shadow_map.draw_shadow_map(scene, frames, seen, _light_source(scene, poses, i), zero)
@@ -100,18 +100,18 @@ def lit_by(
     lights: tuple[LightPoses, dict[int, ShadowMap]],
     surface: shading.Surface,
 ) -> dict[int, Array]:
-    """Returns which pixels each shadow-casting light reaches.
+    """Computes for each light that casts shadows which pixels of an H x W image the light reaches.
 
     Args:
-      scene: RenderScene.
-      frames: Frames of the geoms.
-      hits: Hits of the pixels, with exact depths.
-      rays: slopes of the pixels' rays, f32[1, W] and f32[H, 1].
-      lights: LightPoses, and what `shadow_maps` returned; an empty dictionary without triangles.
-      surface: Surface of the pixels.
+      scene: the compiled scene.
+      frames: poses of the geoms relative to the camera.
+      hits: geom that each pixel shows, with exact depth.
+      rays: x f32[1, W] and y f32[H, 1] of the directions (x, y, -1) of the pixels' rays, in the camera's frame.
+      lights: poses of the lights in the camera's frame, and the result of `shadow_maps` (empty without triangles).
+      surface: point and normal of the surface that each pixel shows.
 
     Returns:
-      f32[H, W], 0 in the shadow and 1 elsewhere, for each light that casts shadows, by the light's row.
+      {number of the light in the scene: f32[H, W], 0 in the shadow and 1 elsewhere}.
     """
     poses, maps = jax.lax.stop_gradient(lights)
     lit = {}
@@ -132,17 +132,20 @@ def incidences(
     rays: tuple[Array, Array],
     lit: dict[int, Array],
 ) -> list[shading.Incidence]:
-    """Returns the terms of all lights at each pixel's surface.
+    """Computes the diffuse and specular light of each light source at the surface that each pixel of an image shows.
+
+    The image has H x W pixels.
 
     Args:
-      scene: RenderScene.
-      poses: LightPoses.
-      surface: Surface of the pixels.
-      rays: slopes of the pixels' rays, f32[1, W] and f32[H, 1].
-      lit: what `lit_by` returned. A light that is missing there has no shadows.
+      scene: the compiled scene.
+      poses: poses of the lights in the camera's frame.
+      surface: the surface that each pixel shows.
+      rays: x f32[1, W] and y f32[H, 1] of the directions (x, y, -1) of the pixels' rays, in the camera's frame.
+      lit: shadows of the lights, from `lit_by`. A light that is missing there has no shadows.
 
     Returns:
-      Incidence of each light of the scene in order, then of the headlight, which shines along the camera's axis.
+      Strength, diffuse and specular term of each light in the scene's order, then of the headlight. The headlight
+      shines along the camera's axis.
     """
     to_camera, result, one = _to_camera(*rays), [], jnp.ones((), dtype=jnp.float32)
     for index, is_directional in enumerate(scene.lights.is_directional):

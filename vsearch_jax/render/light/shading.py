@@ -22,15 +22,15 @@ _TINY = 1e-12
 
 
 class Surface(NamedTuple):
-    """The surface that each pixel shows, in the camera's frame.
+    """The surface that each pixel of an H x W image shows, in the camera's frame.
 
     Attributes:
-      point: three f32[H, W] m.
+      point: three f32[H, W] m, the point that the pixel shows.
       normal: three f32[H, W], unit, towards the camera's side. On a face it is the interpolated smooth normal.
       flat: three f32[H, W], unit, towards the camera's side. On a face it is the normal of the face's plane, elsewhere
         it equals `normal`.
-      rgb: three f32[H, W] in [0, 1].
-      specular: f32[H, W] in [0, 1].
+      rgb: three f32[H, W] in [0, 1], colour of the geom.
+      specular: f32[H, W] in [0, 1], strength of the highlight.
       shininess: f32[H, W], exponent of the highlight.
       emission: f32[H, W], emitted light in units of `rgb`.
       tint: three f32[H, W], colour of the texture, which multiplies the lit colour; None in a scene without textures.
@@ -47,7 +47,7 @@ class Surface(NamedTuple):
 
 
 class Incidence(NamedTuple):
-    """The terms of one light at each pixel's surface.
+    """How one light falls on the surface that each pixel of an H x W image shows: the terms of MuJoCo's light model.
 
     Attributes:
       strength: f32[H, W], the part of the light that arrives, after attenuation, cone and shadows.
@@ -71,13 +71,13 @@ def _incidence(surface: Surface, to_camera: Vector, to_light: Vector, strength: 
 
 
 def directional_incidence(surface: Surface, to_camera: Vector, to_light: Array, is_lit: Array) -> Incidence:
-    """Returns the terms of a directional light.
+    """Computes how a directional light falls on the surface that each pixel of an H x W image shows.
 
     Args:
-      surface: Surface.
+      surface: the surface that each pixel shows.
       to_camera: three f32[H, W], unit vectors from the surface to the camera.
       to_light: f32[3], unit vector towards the light.
-      is_lit: f32[H, W] or f32[], 0 in the shadow, 1 elsewhere.
+      is_lit: f32[H, W] or f32[], 0 where another geom shadows the light, 1 elsewhere.
     """
     return _incidence(surface, to_camera, (to_light[0], to_light[1], to_light[2]), is_lit)
 
@@ -85,15 +85,15 @@ def directional_incidence(surface: Surface, to_camera: Vector, to_light: Array, 
 def positional_incidence(
     surface: Surface, to_camera: Vector, pose: tuple[Array, Array], lights: Lights, index: int, is_lit: Array
 ) -> Incidence:
-    """Returns the terms of a spot or point light.
+    """Computes how a spot or point light falls on the surface that each pixel of an H x W image shows.
 
     Args:
-      surface: Surface.
+      surface: the surface that each pixel shows.
       to_camera: three f32[H, W], unit vectors from the surface to the camera.
-      pose: position f32[3] m and direction f32[3], unit, of the light.
-      lights: Lights, for attenuation, cutoff and exponent.
-      index: row of the light in `lights`; static.
-      is_lit: f32[H, W] or f32[], 0 in the shadow, 1 elsewhere.
+      pose: position f32[3] m of the light, and unit vector f32[3] along which the light shines.
+      lights: all lights of the scene. Attenuation, cutoff and exponent are read.
+      index: number of this light in `lights`; static.
+      is_lit: f32[H, W] or f32[], 0 where another geom shadows the light, 1 elsewhere.
     """
     position, direction = pose
     offset = (position[0] - surface.point[0], position[1] - surface.point[1], position[2] - surface.point[2])
@@ -109,12 +109,12 @@ def positional_incidence(
 
 
 def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> list[Array]:
-    """Returns the lit colour of each pixel.
+    """Computes the colour of each pixel of an H x W image from its surface and the lights that fall on it.
 
     Args:
-      scene: RenderScene, for the colours of the lights.
-      surface: Surface.
-      incidences: Incidence of each light of the scene in order, then of the headlight.
+      scene: the compiled scene. The colours of the lights are read.
+      surface: the surface that each pixel shows.
+      incidences: how each light falls on the surface: the lights in the scene's order, then the headlight.
 
     Returns:
       Red, green and blue, f32[H, W] in [0, 1] each.

@@ -39,7 +39,7 @@ _BIAS = 0.3
 
 
 class ShadowMap(NamedTuple):
-    """The depth of the first face on each ray of a light; S is the number of cells along an edge.
+    """A depth image as a light sees the faces of meshes and height fields. The image has S x S cells (pixels).
 
     Attributes:
       depth: f32[S, S] m along the axis of the light's view, +inf where a ray meets no face.
@@ -123,15 +123,15 @@ def draw_shadow_map(
     light: tuple[Array, bool],
     zero: Array,
 ) -> ShadowMap:
-    """Returns the shadow map of one light.
+    """Draws the shadow map of one light: a depth image of meshes and height fields as the light sees them.
 
     Args:
-      scene: RenderScene with triangles.
-      frames: Frames of the geoms.
-      seen: points that the camera sees, three f32[...] m in its frame, and bool[...], whether the pixel hits a geom.
-      light: f32[3] and whether the light is directional, static. The vector is in the camera's frame: a unit vector
-        towards a directional light, else the light's position in m.
-      zero: i32[], 0 at run time; see `vsearch_jax.xla.materialize`.
+      scene: the compiled scene, with meshes or height fields.
+      frames: poses of the geoms relative to the camera.
+      seen: point that each pixel sees, three f32[...] m in the camera's frame; and bool[...], whether there is one.
+      light: vector f32[3] in the camera's frame, and whether the light is directional (static). The vector is a unit
+        vector towards a directional light, or the position in m of another light.
+      zero: i32[], a 0 that the compiler does not know to be 0. It keeps XLA from computing results twice.
     """
     triangles = scene.triangles
     assert triangles is not None
@@ -159,12 +159,12 @@ def draw_shadow_map(
 
 
 def is_lit(shadow: ShadowMap, point: Vector, normal: Vector, is_directional: bool, offset: Array) -> Array:
-    """Returns f32[H, W]: 0 where the map has a face between the point and the light, else 1.
+    """Returns for each of H x W points f32[H, W]: 0 if the map has a face between the point and the light, else 1.
 
     Args:
-      shadow: ShadowMap.
-      point: three f32[H, W] m, in the camera's frame.
-      normal: three f32[H, W], unit normals of the surface there, in the camera's frame.
+      shadow: shadow map of the light.
+      point: three f32[H, W] m, the points, in the camera's frame.
+      normal: three f32[H, W], unit normals of the surface at the points, in the camera's frame.
       is_directional: whether the light is directional; static.
       offset: f32[] m. A face that is nearer to the light by less than this casts no shadow.
     """

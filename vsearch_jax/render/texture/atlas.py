@@ -32,13 +32,13 @@ class Textures:
     """All textures of a scene. X is the number of textures, L the number of mipmap levels, G the number of geoms.
 
     Attributes:
-      texels: i32[N]; the low three bytes are red, green and blue.
+      texels: i32[N], all N texels of all textures; the low three bytes are red, green and blue.
       start: i32[X * 6 * L], index of the first texel of each image, by texture, side and level.
-      width: f32[X] texels, of level 0.
-      height: f32[X] texels, of level 0.
+      width: f32[X] texels, width of level 0, the largest.
+      height: f32[X] texels, height of level 0.
       texture: i32[G], row of each geom's texture; 0 if it has none.
       scale: f32[2, G]; texture coordinates are `scale` times the coordinates of the source, plus `shift`.
-      shift: f32[2, G].
+      shift: f32[2, G], added to the scaled coordinates.
       extent: f32[3, G] m; for a cube map, the direction is the point in the geom's frame divided by `extent`.
       modes: for each geom NO_TEXTURE, MESH, PLANAR, CUBE or PRIMITIVE; static.
       num_levels: L; static.
@@ -59,25 +59,25 @@ class Textures:
 
 
 def rgb_texture(model: mujoco.MjModel, geom: int) -> int:
-    """Returns the id of the texture for a geom's colour, or -1 if it has none.
+    """Returns MuJoCo's id of the texture that colours a geom, or -1 if the geom has no such texture.
 
     Args:
-      model: the compiled model.
-      geom: id of the geom.
+      model: the compiled MuJoCo model.
+      geom: MuJoCo's id of the geom.
     """
     material = int(model.geom_matid[geom])
     return -1 if material < 0 else int(model.mat_texid[material, mjtTextureRole.mjTEXROLE_RGB])
 
 
 def compile_textures(model: mujoco.MjModel, geoms: np.ndarray) -> Textures | None:
-    """Returns the textures of geoms and the first skybox.
+    """Collects the textures of some geoms, and the model's first skybox, into one texture atlas for the renderer.
 
     Args:
-      model: the compiled model.
-      geoms: int[G], ids of the scene's geoms.
+      model: the compiled MuJoCo model.
+      geoms: int[G], MuJoCo's ids of the G geoms that are drawn.
 
     Returns:
-      Textures, with the geoms in the given order, or None if there are no textures.
+      The atlas, with the geoms in the given order. None if there are no textures.
     """
     geom_textures = [rgb_texture(model, g) for g in geoms]
     skyboxes = np.flatnonzero(model.tex_type == mjtTexture.mjTEXTURE_SKYBOX)

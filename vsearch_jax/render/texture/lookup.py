@@ -185,14 +185,14 @@ def colour(
     local: tuple[Vector, Vector],
     texcoord: Coordinates | None,
 ) -> Vector:
-    """Returns the colour of each pixel's texture.
+    """Computes the texture's colour at the surface point that each pixel of an H x W image shows.
 
     Args:
-      textures: Textures.
+      textures: all textures of the scene.
       slot: i32[H, W], row of each pixel's geom in the scene.
-      starts: (mjtGeom, first row) of each geom type in the scene; see `level_sets.level`. Static.
-      local: sizes of each pixel's geom, and the point in its frame; three f32[H, W] m each.
-      texcoord: u and v of faces, f32[H, W] each, or None if no mesh has texture coordinates.
+      starts: (mjtGeom, first row) of each geom type in the scene, sorted by row. Static.
+      local: size of each pixel's geom (`geom_size`), and the point in the geom's frame; three f32[H, W] m each.
+      texcoord: texture coordinates u and v at pixels that show a mesh, f32[H, W] each. None if no mesh has any.
 
     Returns:
       Red, green and blue in [0, 1], f32[H, W] each; 1 for geoms without a texture.
@@ -221,11 +221,12 @@ def colour(
 
 
 def sky(textures: Textures, direction: Vector) -> Vector:
-    """Returns the colour of the skybox.
+    """Computes the colour of the skybox for each pixel of an H x W image.
 
     Args:
-      textures: Textures with a skybox.
-      direction: three f32[H, W], in world, of any length but 0. The texture's y axis is the world's z axis.
+      textures: all textures of the scene, with a skybox.
+      direction: three f32[H, W], direction of each pixel's ray in world, of any length but 0. The y axis of the skybox
+        is the world's z axis.
 
     Returns:
       Red, green and blue in [0, 1], f32[H, W] each.
