@@ -1,4 +1,4 @@
-"""Made-up results of an evaluation, for tests of what is done with them."""
+"""Made-up results of an evaluation and a made-up reachability map, for tests of the code that uses them."""
 
 from typing import Any
 
@@ -9,12 +9,18 @@ from vsearch_jax.types import ReachabilityMap, View
 
 
 def trials(shape: tuple[int, ...], generations: int, seed: int = 0) -> dict[str, Any]:
-    """Made-up arrays of `evaluate` for one searcher."""
+    """Returns made-up measures of one searcher, as `evaluate` gives them.
+
+    Args:
+      shape: [trials] or [seeds, episodes].
+      generations: length of `best_scores`.
+      seed: of the random values.
+    """
     random = np.random.default_rng(seed)
     is_success = random.random(shape) < 0.9
     rotation = np.where(is_success, random.gamma(2.0, 0.03, shape), 2.5).astype(np.float32)
     best = np.sort(random.random((*shape, generations)) ** 0.2, axis=-1).astype(np.float32)
-    view = View(random.random(shape).astype(np.float32), random.random(shape).astype(np.float32))
+    view = View(jnp.asarray(random.random(shape), jnp.float32), jnp.asarray(random.random(shape), jnp.float32))
     return {
         "is_success": is_success,
         "evaluations": random.integers(2, 10 * generations, shape).astype(np.int32),
@@ -34,7 +40,7 @@ def trials(shape: tuple[int, ...], generations: int, seed: int = 0) -> dict[str,
 
 
 def evaluation(num_seeds: int = 1) -> dict[str, Any]:
-    """Made-up arrays of `evaluate`."""
+    """Returns a made-up result of `evaluate`: 12 trials of each black-box searcher, 40 episodes of each policy."""
     shape = (num_seeds, 40)
     steps = {
         "evaluations": np.full(shape, 4),
@@ -45,13 +51,13 @@ def evaluation(num_seeds: int = 1) -> dict[str, Any]:
 
 
 def search() -> dict[str, Any]:
-    """What `record_search` could have returned: two steps to the threshold."""
+    """Returns a made-up result of `record_search`: the search ends after two steps."""
     images = np.random.default_rng(2).random((21, 16, 16, 3)).astype(np.float32)
     return {"images": images, "similarity": np.linspace(0.1, 1.0, 21), "target": images[2], "num_steps": np.int32(2)}
 
 
 def reach() -> ReachabilityMap:
-    """A map whose reachable cells are those of the band."""
+    """Returns a map with the band from 45 to 60 degrees; only cells at these elevations are reachable."""
     elevations = jnp.linspace(0, jnp.pi / 2, 7)
     return ReachabilityMap(
         azimuths=jnp.linspace(0, 2 * jnp.pi, 12, endpoint=False),

@@ -1,9 +1,9 @@
-"""Episodes of the policies."""
+"""Evaluation episodes of the policies."""
 
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -11,14 +11,25 @@ from jax import Array
 
 from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv, episode_of
-from vsearch_jax.evaluation.outcome import measure_outcome
+from vsearch_jax.evaluation.outcome import Outcome, measure_outcome
 from vsearch_jax.evaluation.step_bound import steps_lower_bound
 from vsearch_jax.search import SearchArgs, sac
 from vsearch_jax.types import Observation, TrainState
 
+if TYPE_CHECKING:
+    from flax import nnx
+
 
 def episode_keys(key: Array, config: Config) -> tuple[Array, Array]:
-    """Returns keys [seeds, episodes, 2] of each episode's initial view and target, and keys [seeds, episodes] of it."""
+    """Splits a PRNG key into the keys of all evaluation episodes: E episodes for each of the run's S policies.
+
+    Args:
+      key: PRNG key of the policies' evaluation.
+      config: gives the number of policies S (one for each policy seed) and of episodes E.
+
+    Returns:
+      Keys [S, E, 2] of each episode's initial view and target view, and keys [S, E] of each episode's search.
+    """
     seeds = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(config.sac.num_seeds))
     split = functools.partial(jax.random.split, num=config.evaluation.num_episodes)
     reset_keys, search_keys = jnp.moveaxis(jax.vmap(jax.vmap(jax.random.split))(jax.vmap(split)(seeds)), -1, 0)
@@ -27,28 +38,43 @@ def episode_keys(key: Array, config: Config) -> tuple[Array, Array]:
 
 def evaluate_policies(
     env: ViewSearchEnv, state: TrainState, episodes: tuple[Array, Observation], grid: Observation
-) -> dict[str, Any]:
-    """Runs every policy in its `num_episodes` episodes; see `evaluate` for the result.
+) -> Outcome:
+    """Runs each of the S trained policies in its E evaluation episodes, and measures how each search ended.
 
     Args:
       env: the task.
-      state: holds the policies.
-      episodes: keys [seeds, episodes] and Observation [seeds, episodes, 2] of initial view and target.
-      grid: Observation of views over the band, for the bound.
+      state: trained state that holds the S policies.
+      episodes: PRNG key of each search, [S, E]; and what the camera sees from initial view and target view, [S, E, 2].
+      grid: what the camera sees from a grid of views over the band (reachable elevations). It gives the lower bound on
+        the steps.
+
+    Returns:
+      Measures by name, arrays [S, E]; `evaluate` describes them.
     """
 
-    def one_policy(xs: tuple[Any, tuple[Array, Observation]]) -> dict[str, Any]:
-        actor, own = xs
+    def run_episodes_of_policy(policy: tuple[nnx.State, tuple[Array, Observation]]) -> Outcome:
+        actor, own_episodes = policy
         run = functools.partial(run_episode, env=env, actor=actor, grid=grid)
-        return jax.lax.map(run, own, batch_size=env.config.evaluation.batch_size)
+        return jax.lax.map(run, own_episodes, batch_size=env.config.evaluation.batch_size)
 
-    return jax.lax.map(one_policy, (state.sac.actor, episodes))
+    return jax.lax.map(run_episodes_of_policy, (state.sac.actor, episodes))
 
 
 def run_episode(
-    episode: tuple[Array, Observation], *, env: ViewSearchEnv, actor: Any, grid: Observation
-) -> dict[str, Any]:
-    """Runs one episode of a policy and measures where it ended."""
+    episode: tuple[Array, Observation], *, env: ViewSearchEnv, actor: nnx.State, grid: Observation
+) -> Outcome:
+    """Runs one evaluation episode of a policy, and measures how the search ended: success, steps, pose errors.
+
+    Args:
+      episode: PRNG key of the search; and what the camera sees from initial view and target view, [2].
+      env: the task.
+      actor: parameters of the policy.
+      grid: what the camera sees from a grid of views over the band (reachable elevations). It gives the lower bound on
+        the steps.
+
+    Returns:
+      Measures of the episode by name; `evaluate` describes them.
+    """
     search_key, observations = episode
     start = env.start(*(jax.tree.map(lambda x, i=i: x[i], observations) for i in range(2)))
     first = episode_of(start)
@@ -59,11 +85,13 @@ def run_episode(
         task=sac.PolicyTask(actor, start),
     )
     result = sac.search(search_key, env.step, args, env.config)
-    last = episode_of(result.end.state)
+    end = result.end
+    assert end is not None  # the policy's search always sets it; only the black-box searchers leave it out
+    last = episode_of(end.state)
     return measure_outcome(env.config, result, last.observation.camera, last.target.camera) | {
-        "num_helped": result.end.num_helped,
-        "joint_travel": result.end.travel,
-        "motion_time": result.end.duration,
+        "num_helped": end.num_helped,
+        "joint_travel": end.travel,
+        "motion_time": end.duration,
         "num_plans": result.evaluations,
         "initial_view": first.observation.view,
         "target_view": first.target.view,

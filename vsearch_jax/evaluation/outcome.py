@@ -1,20 +1,37 @@
-"""What is measured of a search that has ended."""
+"""Measures of a finished search."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TypeAlias
+
+from jax import Array
 
 from vsearch_jax.config import Config
 from vsearch_jax.env import pose_error
-from vsearch_jax.types import Camera, SearchResult
+from vsearch_jax.types import Camera, SearchResult, View
 
 FALSE_POSITIVE_DEG = 10.0
-"""A found view whose rotation is further than this from the target's is a false positive (thesis 3.6)."""
+"""A found view is a false positive if its rotation error is larger than this (thesis 3.6)."""
+
+Outcome: TypeAlias = dict[str, Array | View]
+"""Measures of one or more finished searches, by name."""
 
 
-def measure_outcome(config: Config, result: SearchResult, camera: Camera, target: Camera) -> dict[str, Any]:
-    """Returns the measures of a search that ended at `camera`, when `target` was looked for."""
+def measure_outcome(config: Config, result: SearchResult, camera: Camera, target: Camera) -> Outcome:
+    """Measures one finished search: success, number of images, pose errors with respect to the target camera.
+
+    Args:
+      config: the run's config; `env.threshold` is read.
+      result: the searcher's result.
+      camera: camera in world at the end of the search.
+      target: camera in world at the target view.
+
+    Returns:
+      Measures by name; `evaluate` describes them. `is_success` bool[], `evaluations` i32[], `final_cosine` f32[],
+      `rotation_error` f32[] rad, `frobenius_angle` f32[] rad, `translation_error` f32[] m, `is_false_positive` bool[],
+      `unreachable` i32[], and `best_scores` f32[G], G = the largest number of generations that the config allows.
+    """
     rotation, frobenius, translation = pose_error(camera, target)
     is_success = result.score >= config.env.threshold
     return {

@@ -1,90 +1,134 @@
-"""One search of a policy in pictures."""
+"""Records one search of a policy as images."""
 
 from __future__ import annotations
 
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
+from brax.envs.base import State
 from jax import Array
 
 from vsearch_jax.config import Config
-from vsearch_jax.env import ViewSearchEnv
+from vsearch_jax.env import ViewSearchEnv, episode_of
 from vsearch_jax.evaluation.views import ViewRequest, observe_request, protocol_target
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search import sac
 from vsearch_jax.types import TrainState, View
 from vsearch_jax.xla.tree import tree_where
 
+if TYPE_CHECKING:
+    from flax import nnx
+
+StepOutput = TypeVar("StepOutput")
+
 
 @functools.partial(jax.jit, static_argnames="config")
 def record_search(state: TrainState, config: Config) -> dict[str, Array]:
-    """Returns one search of the first policy in pictures: from the far side of the object to the protocol's target.
+    """Records the images of one search by the run's first policy.
+
+    The search starts behind the object and looks for the target view of the evaluation.
+
+    Args:
+      state: a trained state.
+      config: the run's config.
 
     Returns:
-      `images` f32[T + 1, H, W, 3], start first, T = `episode_length`; `similarity` f32[T + 1]; `target` f32[H, W, 3];
-      `num_steps` i32[], after which the rest repeats.
+      `images` f32[T + 1, H, W, 3] of the wrist camera, H x W pixels each, the initial view first; T is the config's
+      `episode_length`. `similarity` f32[T + 1], cosine of each image's code and the target's code. `target`
+      f32[H, W, 3], the target image. `num_steps` i32[], steps until the end of the search. After `num_steps` steps the
+      last image and similarity repeat.
     """
     env = ViewSearchEnv(config, state.encoder, state.reach)
     actor = first_actor(state)
     start = start_episode(env, opposite_start(env, state.key))
 
-    def step(now: Any) -> tuple[Any, None]:
-        return env.step(now, sac.act(None, actor, now.obs, config.sac)), None
+    def step(now: State) -> tuple[State, None]:
+        return env.step(now, mean_action(actor, now, config)), None
+
+    def render_wrist(qpos: Array) -> Array:
+        return env.wrist_image(qpos)[1].rgb
 
     states, _ = roll_out(step, start, config.env.episode_length)
+    episodes = episode_of(states)
     return {
-        "images": jax.lax.map(lambda qpos: env.wrist_image(qpos)[1].rgb, states.pipeline_state.observation.qpos),
+        "images": jax.lax.map(render_wrist, episodes.observation.qpos),
         "similarity": states.metrics["similarity"],
-        "target": env.wrist_image(start.pipeline_state.target.qpos)[1].rgb,
-        "num_steps": states.pipeline_state.num_steps[-1],
+        "target": render_wrist(episode_of(start).target.qpos),
+        "num_steps": episodes.num_steps[-1],
     }
 
 
-def first_actor(state: TrainState) -> Any:
-    """Returns the parameters of the first of the run's policies."""
+def first_actor(state: TrainState) -> nnx.State:
+    """Returns the parameters of the run's first policy. A run trains one policy for each policy seed."""
     return jax.tree.map(lambda x: x[0], state.sac.actor)
 
 
+def mean_action(actor: nnx.State, state: State, config: Config) -> Array:
+    """Returns the deterministic action (tanh of the mean) that a policy takes in a brax State.
+
+    Args:
+      actor: parameters of the policy.
+      state: brax State of one episode.
+      config: the run's config; `sac` is read.
+
+    Returns:
+      Action f32[2] in [-1, 1]: change of azimuth and elevation in units of `env.action_scale_deg`.
+    """
+    obs = cast("Array", state.obs)  # brax allows a dictionary too; ViewSearchEnv gives one array
+    return sac.act(None, actor, obs, config.sac)
+
+
 def opposite_start(env: ViewSearchEnv, key: Array) -> ViewRequest:
-    """Returns, leading axis 2, an initial view beyond the object and the protocol's target.
+    """Chooses the two views of a recorded search: an initial view behind the object, and the evaluation's target view.
 
     Args:
       env: the task.
-      key: that of the TrainState.
+      key: PRNG key of the run (`TrainState.key`); the preferred joint values come from it.
+
+    Returns:
+      Requests for the images of exactly these views, leading axis 2: initial view, target view.
     """
     target = protocol_target(env.config)
     initial = View(wrap_angle(target.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))
     views = jax.tree.map(lambda *x: jnp.stack(x), initial, target)
-    keys = jax.random.split(jax.random.fold_in(key, 2**31 - 2))
+    keys = jax.random.split(jax.random.fold_in(key, 2**31 - 2))  # a salt that training does not use
     return ViewRequest(views, jax.vmap(env.random_joints)(keys), jnp.ones(2, bool))
 
 
-def start_episode(env: ViewSearchEnv, ends: ViewRequest) -> Any:
-    """Returns the brax State at the start of the episode between `ends`, initial view and target on a leading axis."""
+def start_episode(env: ViewSearchEnv, ends: ViewRequest) -> State:
+    """Starts an episode from requested views: takes the images of initial view and target view.
+
+    Args:
+      env: the task.
+      ends: the requested views, leading axis 2: initial view, target view.
+
+    Returns:
+      brax State at the start of the episode.
+    """
     observations = jax.lax.map(functools.partial(observe_request, env), ends)
     return env.start(*(jax.tree.map(lambda x, i=i: x[i], observations) for i in range(2)))
 
 
-def roll_out(step: Callable[[Any], tuple[Any, Any]], start: Any, length: int) -> tuple[Any, Any]:
-    """Follows an episode to its end.
+def roll_out(step: Callable[[State], tuple[State, StepOutput]], start: State, length: int) -> tuple[State, StepOutput]:
+    """Runs one episode for T steps, and returns all states. After the end of the episode the last state repeats.
 
     Args:
-      step: brax State -> the next one, and whatever is to be kept of the step.
-      start: brax State.
-      length: T, the most steps.
+      step: function from the brax State to the next State and to any pytree that is to be kept of the step.
+      start: brax State at the start of the episode.
+      length: number of steps T.
 
     Returns:
-      States, leading axis T + 1, the start first, and what was kept, leading axis T. After the end the state repeats.
+      States, leading axis T + 1, `start` first; and the pytrees of the steps, leading axis T.
     """
 
-    def go_on(state: Any, _: None) -> tuple[Any, Any]:
-        moved, kept = step(state)
-        moved = tree_where(state.done > 0, state, moved)
-        return moved, (moved, kept)
+    def step_until_done(state: State, _: None) -> tuple[State, tuple[State, StepOutput]]:
+        next_state, output = step(state)
+        next_state = tree_where(state.done > 0, state, next_state)
+        return next_state, (next_state, output)
 
-    _, (states, kept) = jax.lax.scan(go_on, start, length=length)
-    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states), kept
+    _, (states, outputs) = jax.lax.scan(step_until_done, start, length=length)
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states), outputs

@@ -1,4 +1,4 @@
-"""How few steps an episode can take, whatever the policy."""
+"""Lower bound on the number of steps of an episode."""
 
 from __future__ import annotations
 
@@ -12,38 +12,49 @@ from vsearch_jax.geometry import angle_difference, cosine_similarity
 from vsearch_jax.types import Observation, View
 
 GRID_AZIMUTHS, GRID_ELEVATIONS = 144, 13
-"""Views on which the lower bound of an episode's steps looks for the threshold: every 2.5 degrees."""
+"""Size of the grid over the band. 144 azimuths are 2.5 degrees apart."""
 
 
 def band_grid(band: Array) -> View:
-    """Returns View of f32[N] rad: a grid over all azimuths and the elevations of `band` (f32[2] rad)."""
+    """Returns a grid of views over all azimuths and the elevations of the reachable band, for `steps_lower_bound`.
+
+    Args:
+      band: f32[2] rad, lowest and highest elevation of the grid.
+
+    Returns:
+      The N = `GRID_AZIMUTHS` * `GRID_ELEVATIONS` views: a View of f32[N] rad.
+    """
     azimuths = jnp.linspace(-jnp.pi, jnp.pi, GRID_AZIMUTHS, endpoint=False)
     elevations = jnp.linspace(band[0], band[1], GRID_ELEVATIONS)
     return View(*(x.reshape(-1) for x in jnp.meshgrid(azimuths, elevations)))
 
 
 def steps_lower_bound(initial: View, target: Observation, grid: Observation, band: Array, config: Config) -> Array:
-    """Returns i32[], fewer steps than which no policy can need: a bound for one episode.
+    """Computes a lower bound on the number of steps that any policy needs in one episode.
 
-    A step changes azimuth and elevation by at most `action_scale_deg` each. The episode ends at the nearest view that
-    meets the threshold, which need not be the target. A whole spacing of the grid is subtracted: views within it of the
-    target, or of one of the `grid`'s that meets the threshold, may meet it too.
+    A step changes azimuth and elevation by at most `action_scale_deg` each. The episode ends at any view whose code
+    meets the threshold, so the bound takes the nearest such view: the target, or a view of the grid. Views between
+    the grid's points may meet the threshold too. So one grid spacing is subtracted from every distance.
 
     Args:
-      initial: View of f32[] rad.
-      target: Observation of the target.
-      grid: Observation of f32[N, ...], of the views of `band_grid`.
-      band: f32[2] rad, the elevations that `grid` spans.
-      config: the run's.
+      initial: initial view of the episode, f32[] rad.
+      target: what the camera sees from the target view.
+      grid: what the camera sees from the N views of `band_grid`: an Observation of f32[N, ...].
+      band: f32[2] rad, lowest and highest elevation of the grid.
+      config: `env.threshold` and `env.action_scale_deg` are read.
+
+    Returns:
+      Lower bound on the number of steps, i32[], at least 1.
     """
     azimuth_spacing = 2.0 * jnp.pi / GRID_AZIMUTHS
     elevation_spacing = (band[1] - band[0]) / (GRID_ELEVATIONS - 1)
 
-    def way(view: View) -> Array:
+    def angle_to(view: View) -> Array:
+        """Returns the larger of the changes of azimuth and elevation in rad, less one grid spacing."""
         azimuth = jnp.abs(angle_difference(view.azimuth, initial.azimuth)) - azimuth_spacing
         return jnp.maximum(azimuth, jnp.abs(view.elevation - initial.elevation) - elevation_spacing)
 
     is_found = cosine_similarity(grid.code, target.code[None]) >= config.env.threshold
-    to_grid = jnp.where(is_found, way(grid.view), jnp.inf).min()
-    steps = jnp.minimum(to_grid, way(target.view)) / math.radians(config.env.action_scale_deg)
+    to_grid = jnp.where(is_found, angle_to(grid.view), jnp.inf).min()
+    steps = jnp.minimum(to_grid, angle_to(target.view)) / math.radians(config.env.action_scale_deg)
     return jnp.maximum(jnp.ceil(steps - 1e-5), 1.0).astype(jnp.int32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +18,52 @@ from vsearch_jax.types import Camera, Observation, SearchResult, View
 from vsearch_jax.xla.batching import map_in_batches
 
 
-class _Trial(NamedTuple):
-    """A trial under way.
+class TrialResults(NamedTuple):
+    """Results of one searcher. A trial is one search; each array has a leading axis of N trials.
 
     Attributes:
-      states: of all searchers, of which only the one's that is running changes.
-      camera: where the arm saw the best view.
-      qpos: f32[nq] rad or m, where the arm stands.
-      costs: f32[2], travel in rad and duration in s of the motions so far.
+      result: best view, score and number of images of each trial.
+      motions: cost of each trial's motions: `joint_travel` f32[N] rad, `motion_time` f32[N] s, `num_plans` i32[N].
+      camera: camera in world at the best view of each trial.
     """
 
-    states: tuple[Any, ...]
+    result: SearchResult
+    motions: dict[str, Array]
+    camera: Camera
+
+
+class _Bench(NamedTuple):
+    """What all trials of one searcher share. It holds functions too, so it is no pytree.
+
+    Attributes:
+      env: the task.
+      methods: all searchers, each in parts.
+      number: i32[], index into `methods` of the searcher that runs.
+      target: Observation of the target.
+    """
+
+    env: ViewSearchEnv
+    methods: tuple[Method, ...]
+    number: Array
+    target: Observation
+
+    @property
+    def num_views(self) -> int:
+        """Views of a generation, padded to the largest of all searchers."""
+        return max(method.num_views for method in self.methods)
+
+
+class _Trial(NamedTuple):
+    """Loop state of one trial.
+
+    Attributes:
+      states: one state for each searcher; only the state of the running searcher changes.
+      camera: Camera at the best view.
+      qpos: f32[nq] rad or m, present joints of the arm.
+      costs: f32[2], travel in rad and duration in s, summed over the motions so far.
+    """
+
+    states: tuple[object, ...]
     camera: Camera
     qpos: Array
     costs: Array
@@ -36,32 +71,32 @@ class _Trial(NamedTuple):
 
 def search_trials(
     keys: Array, env: ViewSearchEnv, methods: tuple[Method, ...], starts: tuple[Observation, Array], target: Observation
-) -> list[tuple[SearchResult, dict[str, Array], Camera]]:
-    """Runs every searcher from each of `starts`, one searcher after the other.
+) -> list[TrialResults]:
+    """Runs all trials of the black-box searchers: one search by every searcher from each of N initial views.
 
-    All take their images in one place: taking images is what is long to compile.
+    The searchers run one after another, and the trials of one searcher in batches. All searchers share one call of the
+    renderer, since each call is compiled anew.
 
     Args:
-      keys: PRNG key of each searcher.
+      keys: PRNG keys [len(methods)], one for each searcher.
       env: the task.
-      methods: the searchers' parts.
-      starts: Observation of f32[N, ...] of the initial views and their scores f32[N].
-      target: Observation of the target.
+      methods: the searchers, each in parts (start, ask, tell, record).
+      starts: what the camera sees from the N initial views (Observation of f32[N, ...]), and the views' scores f32[N].
+      target: what the camera sees from the target view.
 
     Returns:
-      For each searcher its results, what its motions cost (`joint_travel` f32 rad, `motion_time` f32 s, `num_plans`
-      i32) and the cameras at the views found, leading axis N.
+      Results of the N trials, for each searcher in the order of `methods`.
     """
-    # With paths the views of a generation are looked at one after the other.
+    # With "path" the views of a generation are observed one after another, so they need no room in the batch.
     num_views = 1 if env.config.env.reachable == "path" else max(method.num_views for method in methods)
     batch_size = max(1, env.config.evaluation.batch_size // num_views)
 
-    def searcher(xs: tuple[Array, Array]) -> _Trial:
-        number, key = xs
-        trial = functools.partial(_trial, env, methods, number, target)
-        return map_in_batches(trial, (jax.random.split(key, starts[1].shape[0]), starts), batch_size)
+    def run_trials_of_searcher(searcher: tuple[Array, Array]) -> _Trial:
+        number, key = searcher
+        run_trial = functools.partial(_run_trial, _Bench(env, methods, number, target))
+        return map_in_batches(run_trial, (jax.random.split(key, starts[1].shape[0]), starts), batch_size)
 
-    trials = jax.lax.map(searcher, (jnp.arange(len(methods)), keys))
+    trials = jax.lax.map(run_trials_of_searcher, (jnp.arange(len(methods)), keys))
     results = []
     for number, method in enumerate(methods):
         own = (trials.states[number], trials.camera, trials.costs)
@@ -69,126 +104,121 @@ def search_trials(
         result = jax.vmap(to_result)(method.record(states))
         # The image of the initial view needs no motion.
         motions = {"joint_travel": costs[:, 0], "motion_time": costs[:, 1], "num_plans": result.evaluations - 1}
-        results.append((result, motions, camera))
+        results.append(TrialResults(result, motions, camera))
     return results
 
 
-def _trial(
-    env: ViewSearchEnv,
-    methods: tuple[Method, ...],
-    number: Array,
-    target: Observation,
-    item: tuple[Array, tuple[Observation, Array]],
-) -> _Trial:
+def _run_trial(bench: _Bench, item: tuple[Array, tuple[Observation, Array]]) -> _Trial:
+    """Runs one trial to its end; `item` is its key, initial observation and initial score."""
     key, (start, score) = item
+    env = bench.env
     args = SearchArgs(
         initial=start.view, band=env.reach.band, threshold=jnp.asarray(env.config.env.threshold), task=None
     )
-    states = tuple(method.start(args, score) for method in methods)
-    body = functools.partial(_generation, env, methods, (number, key), target, args)
+    states = tuple(method.start(args, score) for method in bench.methods)
+    body = functools.partial(_run_generation, bench, key, args)
+    condition = functools.partial(_is_trial_running, bench, args)
+    return jax.lax.while_loop(condition, body, _Trial(states, start.camera, start.qpos, jnp.zeros(2)))
 
-    goes_on = functools.partial(_is_trial_running, methods, number, args)
-    return jax.lax.while_loop(goes_on, body, _Trial(states, start.camera, start.qpos, jnp.zeros(2)))
+
+def _is_trial_running(bench: _Bench, args: SearchArgs, trial: _Trial) -> Array:
+    """Returns bool[]: the running searcher has not finished the trial."""
+    records = [method.record(state) for method, state in zip(bench.methods, trial.states, strict=True)]
+    return jnp.stack([is_running(record, args.threshold) for record in records])[bench.number]
 
 
-def _generation(
-    env: ViewSearchEnv,
-    methods: tuple[Method, ...],
-    searcher: tuple[Array, Array],
-    target: Observation,
-    args: SearchArgs,
-    trial: _Trial,
-) -> _Trial:
-    number, key = searcher
-    num_views = max(method.num_views for method in methods)
+def _run_generation(bench: _Bench, key: Array, args: SearchArgs, trial: _Trial) -> _Trial:
+    """Asks the running searcher for views, observes them and tells it the scores."""
+    methods, numbers = bench.methods, range(len(bench.methods))
 
-    def ask(i: int, states: tuple[Any, ...]) -> tuple[View, tuple[Any, ...]]:
+    def ask(i: int, states: tuple[object, ...]) -> tuple[View, tuple[object, ...]]:
+        """Returns the views of searcher `i`, padded to `bench.num_views`, and the new states."""
         views, state = methods[i].ask(key, args, states[i])
-        missing = num_views - methods[i].num_views
+        missing = bench.num_views - methods[i].num_views
         views = jax.tree.map(lambda x: jnp.pad(x, (0, missing), mode="edge"), views)
         return views, (*states[:i], state, *states[i + 1 :])
 
-    def tell(i: int, states: tuple[Any, ...], views: View, scores: Array) -> tuple[tuple[Any, ...], Array]:
+    def tell(i: int, states: tuple[object, ...], views: View, scores: Array) -> tuple[tuple[object, ...], Array]:
+        """Returns the new states, and the index of the best view or -1; see `Record.best`."""
         own, scores = jax.tree.map(lambda x: x[: methods[i].num_views], (views, scores))
         state = methods[i].tell(key, args, states[i], own, scores)
         return (*states[:i], state, *states[i + 1 :]), methods[i].record(state).best
 
-    numbers = range(len(methods))
-    views, states = jax.lax.switch(number, [functools.partial(ask, i) for i in numbers], trial.states)
-    # Those that only fill up the generation are not.
-    is_asked = jnp.arange(num_views) < jnp.asarray([method.num_views for method in methods])[number]
-    is_over = ~_is_trial_running(methods, number, args, trial)
+    views, states = jax.lax.switch(bench.number, [functools.partial(ask, i) for i in numbers], trial.states)
+    # Padding is not observed.
+    is_requested = jnp.arange(bench.num_views) < jnp.asarray([method.num_views for method in methods])[bench.number]
+    is_over = ~_is_trial_running(bench, args, trial)
     observations, motions, scores = _observe_generation(
-        env, (trial.qpos, is_over), (views, is_asked), target, args.threshold
+        bench, (trial.qpos, is_over), (views, is_requested), args.threshold
     )
-    # Nor is anything after the view that ends the search.
-    is_moved = motions.is_found & taken_images(scores, args.threshold) & is_asked
-    qpos, costs = _add_motion_costs(env, trial, observations.qpos, motions._replace(is_found=is_moved))
-    states, best = jax.lax.switch(number, [functools.partial(tell, i) for i in numbers], states, views, scores)
+    # The arm does not move to padding, nor to views after the one that ends the search.
+    is_moved = motions.is_found & taken_images(scores, args.threshold) & is_requested
+    qpos, costs = _add_motion_costs(bench.env, trial, observations.qpos, motions._replace(is_found=is_moved))
+    states, best = jax.lax.switch(bench.number, [functools.partial(tell, i) for i in numbers], states, views, scores)
     camera = jax.tree.map(lambda new, old: jnp.where(best >= 0, new[best], old), observations.camera, trial.camera)
     return _Trial(states, camera, qpos, costs)
 
 
-def _is_trial_running(methods: tuple[Method, ...], number: Array, args: SearchArgs, trial: _Trial) -> Array:
-    """Returns bool[]: searcher `number` is not done with the trial."""
-    records = [method.record(state) for method, state in zip(methods, trial.states, strict=True)]
-    return jnp.stack([is_running(record, args.threshold) for record in records])[number]
-
-
 def _observe_generation(
-    env: ViewSearchEnv, now: tuple[Array, Array], asked: tuple[View, Array], target: Observation, threshold: Array
+    bench: _Bench, now: tuple[Array, Array], requests: tuple[View, Array], threshold: Array
 ) -> tuple[Observation, Motion, Array]:
-    """Looks at a generation of views, one after the other where paths are asked for.
+    """Observes the views of a generation.
+
+    With `env.reachable` "ik" all views are observed at once, each from the present joints. With "path" they are
+    observed one after another, each from the joints at the view before.
+
+    Args:
+      bench: what the trials share.
+      now: present joints f32[nq] rad or m, and bool[], whether the search is over.
+      requests: View of f32[N] rad, and bool[N], whether to observe it. The arm does not move to the other views.
+      threshold: f32[], score at which the search ends.
+
+    Returns:
+      Observation of f32[N, ...], Motion of f32[N], and scores f32[N], -inf where the arm cannot reach the view.
+    """
+
+    def observe(qpos: Array, is_over: Array, request: tuple[View, Array]) -> tuple[Observation, Motion, Array]:
+        view, is_requested = request
+        observation, motion = bench.env.move_to_view(view, qpos, is_over | ~is_requested)
+        similarity = cosine_similarity(observation.code, bench.target.code)
+        return observation, motion, jnp.where(motion.is_found, similarity, -jnp.inf)
+
+    if bench.env.config.env.reachable == "ik":
+        return jax.vmap(observe, in_axes=(None, None, 0))(*now, requests)
+
+    def observe_next(
+        now: tuple[Array, Array], request: tuple[View, Array]
+    ) -> tuple[tuple[Array, Array], tuple[Observation, Motion, Array]]:
+        qpos, is_over = now
+        observation, motion, score = observe(qpos, is_over, request)
+        qpos = jnp.where(motion.is_found, observation.qpos, qpos)
+        return (qpos, is_over | (score >= threshold)), (observation, motion, score)
+
+    return jax.lax.scan(observe_next, now, requests)[1]
+
+
+def _add_motion_costs(env: ViewSearchEnv, trial: _Trial, goals: Array, motions: Motion) -> tuple[Array, Array]:
+    """Adds the costs of one generation's motions.
+
+    With `env.reachable` "ik" all views are observed from the same joints. But the arm goes from view to view, so here
+    each motion is measured anew from the view before.
 
     Args:
       env: the task.
-      now: joints f32[nq] where the arm stands, and bool[], whether the search is over.
-      asked: View of f32[N] rad, and bool[N], whether it is to be looked at: if not, the arm need not move.
-      target: Observation of the target.
-      threshold: f32[], the score at which the search ends, and with it the motions.
+      trial: gives the joints before the generation and the costs so far.
+      goals: f32[N, nq] rad or m, joints at the views.
+      motions: Motion of f32[N]; motions that are not found cost nothing, and the arm stays.
 
     Returns:
-      What is seen, the motions, and the scores f32[N].
+      Joints f32[nq] after the generation, and costs f32[2] so far.
     """
 
-    def look(here: Array, is_over: Array, asked: tuple[View, Array]) -> tuple[Observation, Motion, Array]:
-        view, is_asked = asked
-        observation, motion = env.move_to_view(view, here, is_over | ~is_asked)
-        return (
-            observation,
-            motion,
-            jnp.where(motion.is_found, cosine_similarity(observation.code, target.code), -jnp.inf),
-        )
-
-    if env.config.env.reachable == "ik":
-        return jax.vmap(look, in_axes=(None, None, 0))(*now, asked)
-
-    def go_on(
-        now: tuple[Array, Array], asked: tuple[View, Array]
-    ) -> tuple[tuple[Array, Array], tuple[Observation, Motion, Array]]:
-        here, is_over = now
-        observation, motion, score = look(here, is_over, asked)
-        return (jnp.where(motion.is_found, observation.qpos, here), is_over | (score >= threshold)), (
-            observation,
-            motion,
-            score,
-        )
-
-    return jax.lax.scan(go_on, now, asked)[1]
-
-
-def _add_motion_costs(env: ViewSearchEnv, trial: _Trial, joints: Array, motions: Motion) -> tuple[Array, Array]:
-    """Returns where the arm stands after the motions to `joints` (f32[N, nq]) that are found, and all costs so far.
-
-    Without paths the views of a generation are looked at from one place, all at once, so here each way is measured
-    anew from the view before.
-    """
-
-    def add(done: tuple[Array, Array], step: tuple[Array, Motion]) -> tuple[tuple[Array, Array], None]:
-        (here, costs), (there, motion) = done, step
+    def add_motion(before: tuple[Array, Array], step: tuple[Array, Motion]) -> tuple[tuple[Array, Array], None]:
+        (qpos, costs), (goal, motion) = before, step
         if env.config.env.reachable == "ik":
-            motion = env.straight_motion(here, there)._replace(is_found=motion.is_found)
+            motion = env.straight_motion(qpos, goal)._replace(is_found=motion.is_found)
         cost = jnp.stack([motion.travel, motion.duration])
-        return (jnp.where(motion.is_found, there, here), costs + jnp.where(motion.is_found, cost, 0.0)), None
+        after = (jnp.where(motion.is_found, goal, qpos), costs + jnp.where(motion.is_found, cost, 0.0))
+        return after, None
 
-    return jax.lax.scan(add, (trial.qpos, trial.costs), (joints, motions))[0]
+    return jax.lax.scan(add_motion, (trial.qpos, trial.costs), (goals, motions))[0]

@@ -1,7 +1,8 @@
-"""Views of the protocol, and what is seen from views that are known before the search."""
+"""Views of the protocol, and the observation of views that are known before the search."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -14,10 +15,17 @@ from vsearch_jax.types import Observation, View
 
 
 def initial_views(config: Config, band: Array) -> View:
-    """Returns View of f32[num_initial_views]: even in azimuth, elevations spread over the band.
+    """Returns the views from which the evaluated random searches and CMA-ES searches start.
 
-    Azimuths lie half a spacing off the axes, equally many in each quadrant; elevations step through 1/6, 3/6 and 5/6 of
-    the band (f32[2] rad).
+    The azimuths are evenly spaced, and half a spacing away from the axes. So each quadrant holds the same number.
+    The elevations repeat 1/6, 3/6 and 5/6 of the reachable band.
+
+    Args:
+      config: the run's config; `evaluation.num_initial_views` is read.
+      band: f32[2] rad, lowest and highest reachable elevation.
+
+    Returns:
+      The initial views: a View of f32[num_initial_views] rad.
     """
     number = jnp.arange(config.evaluation.num_initial_views, dtype=jnp.float32)
     azimuth = wrap_angle((number + 0.5) * (2.0 * jnp.pi / config.evaluation.num_initial_views))
@@ -25,18 +33,18 @@ def initial_views(config: Config, band: Array) -> View:
 
 
 def protocol_target(config: Config) -> View:
-    """Returns the target view of random search and CMA-ES, f32[] rad."""
+    """Returns the view that the evaluated random searches and CMA-ES searches look for: a View of f32[] rad."""
     settings = config.evaluation
     return View(wrap_angle(jnp.deg2rad(settings.target_azimuth_deg)), jnp.deg2rad(settings.target_elevation_deg))
 
 
 class ViewRequest(NamedTuple):
-    """A view to look at.
+    """A request for the observation of one view.
 
     Attributes:
       view: View of f32[] rad.
-      qpos: f32[nq] rad or m, joints near which the arm is to stand, however it is come by.
-      is_fixed: bool[]: where the arm does not reach the view, no other will do.
+      qpos: f32[nq] rad or m, preferred joints; IK returns the solution nearest to them.
+      is_fixed: bool[]. If false, the nearest reachable view of the map replaces a view that the arm cannot reach.
     """
 
     view: View
@@ -44,12 +52,17 @@ class ViewRequest(NamedTuple):
     is_fixed: Array
 
 
-def observe_request(env: ViewSearchEnv, asked: ViewRequest) -> Observation:
-    """Returns what is seen from a view, or from the nearest one of the map if any will do.
+def observe_request(env: ViewSearchEnv, request: ViewRequest) -> Observation:
+    """Brings the camera to the requested view, and returns what it sees there.
 
-    The code of a fixed view that is not reached is 0, which matches nothing.
+    Args:
+      env: the task.
+      request: the view, preferred joint values, and whether a reachable view may replace an unreachable one.
+
+    Returns:
+      What the camera sees. If the arm cannot reach the view and no other view may replace it, the image code is all
+      zeros, so its cosine with any code is 0.
     """
-    view, qpos, is_reached = env.resolve_view(*asked)
+    view, qpos, is_reached = env.resolve_view(*request)
     observation = env.observe_view(view, qpos)
-    code = jnp.where(is_reached, observation.code, 0.0)
-    return observation.replace(code=code)  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
+    return dataclasses.replace(observation, code=jnp.where(is_reached, observation.code, 0.0))

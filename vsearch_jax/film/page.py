@@ -1,4 +1,4 @@
-"""The frames of a film of a search."""
+"""Layout of a film's frames."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from matplotlib.patches import Rectangle
 from vsearch_jax.report.style import COLORS, INK, styled
 
 _INCHES = (12.8, 7.2)
-# Left and lower edge, width and height, in parts of the page.
+# Left and lower edge, width and height, as shares of the frame.
 _OVERVIEW = (0.0, 0.0, 0.5, 1.0)
 _WRIST, _TARGET = (0.53, 0.52, 0.2115, 0.376), (0.77, 0.52, 0.2115, 0.376)
 _CURVE = (0.575, 0.085, 0.4065, 0.31)
 
 
 class Moment(NamedTuple):
-    """What a frame shows.
+    """Content of one frame.
 
     Attributes:
-      overview: u8[H, W, 3], H the film's height and W half its width.
-      wrist: u8[h, h, 3], what the wrist camera sees.
-      time: s since the search began, holds not counted.
-      similarity: cosine of wrist picture and target.
-      view_deg: azimuth and elevation of the wrist camera.
+      overview: u8[H, W, 3], H the height of the film and W half its width.
+      wrist: u8[h, h, 3], image of the wrist camera.
+      time: s since the start of the search, without holds.
+      similarity: cosine of wrist image and target image.
+      view_deg: azimuth and elevation in degrees of the wrist camera.
       caption: what the arm does.
-      is_taken: the policy looks at this wrist picture.
+      is_taken: whether the policy uses this wrist image.
     """
 
     overview: np.ndarray
@@ -44,39 +44,42 @@ class Moment(NamedTuple):
 
 
 class FilmPage:
-    """Draws moments one after another: what stays is drawn once, and the curve grows with them."""
+    """Draws the frames of a film, one moment after another.
+
+    Parts that do not change are drawn once. The curve holds all moments drawn so far.
+    """
 
     @styled
     def __init__(self, target: np.ndarray, axes_limits: tuple[float, float], threshold: float, height: int) -> None:
-        """Lays the page out.
+        """Makes the layout and draws the parts that do not change.
 
         Args:
           target: u8[h, h, 3], the target image.
-          axes_limits: time in s of the last moment and about the lowest cosine of all.
+          axes_limits: time in s of the last moment, and lowest cosine on the curve's axis.
           threshold: cosine at which a view is found.
-          height: of the film, in pixels; its width is 16/9 of it.
+          height: height of the film in pixels; its width is 16/9 of that.
         """
         figure = Figure(figsize=_INCHES, dpi=height / _INCHES[1])
         figure.set_layout_engine("none")
         self._canvas = FigureCanvasAgg(figure)
-        self._overview = _picture(figure.add_axes(_OVERVIEW), np.zeros((1, 1, 3), np.uint8), is_still=False)
-        self._wrist = _picture(figure.add_axes(_WRIST), np.zeros_like(target), is_still=False)
-        _picture(figure.add_axes(_TARGET), target, is_still=True)
-        for (x, y, _, height_), name in ((_WRIST, "wrist camera"), (_TARGET, "target")):
-            figure.text(x, y + height_ + 0.012, name, size=11)
+        self._overview = _show_image(figure.add_axes(_OVERVIEW), np.zeros((1, 1, 3), np.uint8), is_static=False)
+        self._wrist = _show_image(figure.add_axes(_WRIST), np.zeros_like(target), is_static=False)
+        _show_image(figure.add_axes(_TARGET), target, is_static=True)
+        for (x, y, _, image_height), name in ((_WRIST, "wrist camera"), (_TARGET, "target")):
+            figure.text(x, y + image_height + 0.012, name, size=11)
         edge = {"transform": figure.transFigure, "fill": False, "linewidth": 5, "edgecolor": COLORS["cma_es"]}
         self._edge = figure.add_artist(Rectangle(_WRIST[:2], *_WRIST[2:], animated=True, **edge))
-        places = ((0.947, 17), (0.475, 13), (0.443, 11))
-        self._texts = [figure.text(_WRIST[0], y, "", size=size, animated=True) for y, size in places]
-        self._lines = _curve(figure.add_axes(_CURVE), axes_limits, threshold)
+        positions = ((0.947, 17), (0.475, 13), (0.443, 11))
+        self._texts = [figure.text(_WRIST[0], y, "", size=size, animated=True) for y, size in positions]
+        self._lines = _make_curve(figure.add_axes(_CURVE), axes_limits, threshold)
         self._canvas.draw()
-        self._still = self._canvas.copy_from_bbox(figure.bbox)
+        self._background = self._canvas.copy_from_bbox(figure.bbox)
         self._moments: list[tuple[float, float]] = []
         self._taken: list[tuple[float, float]] = []
 
     @styled
     def draw(self, moment: Moment) -> np.ndarray:
-        """Returns the frame u8[height, width, 3] of the next moment."""
+        """Draws the next moment of the film, and returns the finished frame u8[height, width, 3]."""
         now = (moment.time, moment.similarity)
         self._moments.append(now)
         self._taken += [now] * moment.is_taken
@@ -86,28 +89,28 @@ class FilmPage:
         self._wrist.set_data(moment.wrist)
         self._edge.set_visible(moment.is_taken)
         azimuth, elevation = moment.view_deg
-        place = f"azimuth {azimuth:.0f}°, elevation {elevation:.0f}°"
-        for text, content in zip(self._texts, (moment.caption, f"cosine {moment.similarity:.3f}", place), strict=True):
+        view = f"azimuth {azimuth:.0f}°, elevation {elevation:.0f}°"
+        for text, content in zip(self._texts, (moment.caption, f"cosine {moment.similarity:.3f}", view), strict=True):
             text.set_text(content)
-        self._canvas.restore_region(self._still)
+        self._canvas.restore_region(self._background)
         for artist in (self._overview, self._wrist, self._edge, *self._lines, *self._texts):
             self._canvas.figure.draw_artist(artist)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
 
-def _picture(axes: Axes, image: np.ndarray, *, is_still: bool) -> AxesImage:
+def _show_image(axes: Axes, image: np.ndarray, *, is_static: bool) -> AxesImage:
     axes.set_axis_off()
-    return axes.imshow(image, aspect="auto", interpolation="nearest", animated=not is_still)
+    return axes.imshow(image, aspect="auto", interpolation="nearest", animated=not is_static)
 
 
-def _curve(axes: Axes, limits: tuple[float, float], threshold: float) -> tuple[Line2D, Line2D, Line2D]:
-    """Returns the lines of all moments, of those at which a picture is taken, and of the present one."""
+def _make_curve(axes: Axes, limits: tuple[float, float], threshold: float) -> tuple[Line2D, Line2D, Line2D]:
+    """Returns empty lines for all moments, for the moments whose image the policy uses, and for the present moment."""
     seconds, lowest = limits
-    axes.axhline(threshold, color=INK, linestyle="--", linewidth=1.2, label=f"found from {threshold:g}")
-    (line,) = axes.plot([], [], color=COLORS["sac"], linewidth=2.2, animated=True, label="on the way")
-    (taken,) = axes.plot([], [], "o", color=COLORS["cma_es"], markersize=8, animated=True, label="picture taken")
+    axes.axhline(threshold, color=INK, linestyle="--", linewidth=1.2, label=f"threshold {threshold:g}")
+    (line,) = axes.plot([], [], color=COLORS["sac"], linewidth=2.2, animated=True, label="in motion")
+    (taken,) = axes.plot([], [], "o", color=COLORS["cma_es"], markersize=8, animated=True, label="image taken")
     (now,) = axes.plot([], [], "o", color=COLORS["sac"], markersize=5, animated=True)
-    axes.set(xlabel="time of the motions (s)", ylabel="cosine to the target")
+    axes.set(xlabel="motion time (s)", ylabel="cosine with the target")
     axes.set(xlim=(-0.02 * seconds, 1.02 * seconds), ylim=(lowest, 1.05))
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2)
     return line, taken, now

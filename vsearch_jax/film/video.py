@@ -1,4 +1,4 @@
-"""A film of one search by the policy of a finished run."""
+"""Makes a film of one search by the policy of a finished run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from vsearch_jax.config import Config, ConfigError
-from vsearch_jax.film.motions import FPS, MOST_SECONDS, FilmedSearch, Frames, film_search, look_along
+from vsearch_jax.film.motions import FPS, MAX_SECONDS, FilmedSearch, Frames, record_motions, render_frames
 from vsearch_jax.film.overview import overview_camera
 from vsearch_jax.film.page import FilmPage, Moment
 from vsearch_jax.film.writer import FilmError, find_ffmpeg, write_film
@@ -21,22 +21,22 @@ from vsearch_jax.scene import build_scene
 from vsearch_jax.types import TrainState
 
 HEIGHT = 720
-"""Of the film, in pixels; it is 16/9 of that wide."""
+"""Default height of a film in pixels. Its width is 16/9 of the height."""
 HOLD_SECONDS, END_SECONDS = 0.6, 2.5
-"""How long the film stands at each view whose picture is taken, and at the last."""
-_BELOW = 0.25
-"""How far below the lowest cosine of a picture taken the curve's axis goes: on the way it may be lower."""
-_CHUNK = 32
-"""Frames that are in memory at a time."""
+"""How long a film shows each view whose image is taken, and the last view, in s."""
+_AXIS_MARGIN = 0.25
+"""The curve's axis starts this much below the lowest cosine of the images taken: in motion the cosine may be lower."""
+_CHUNK_SIZE = 32
+"""Frames held in memory at a time."""
 
 
 class _Plan(NamedTuple):
-    """The frames of a film; N is their number, holds not counted.
+    """The frames of a film without holds; N is their number.
 
     Attributes:
       qpos: f32[N, nq] rad or m.
-      steps: i32[N], the step of the search that a frame is part of; 0 is the start.
-      is_taken: bool[N], the policy looks at the frame's wrist picture.
+      steps: i32[N], step of the search that a frame belongs to; 0 is the start.
+      is_taken: bool[N], whether the policy uses the wrist image of a frame.
     """
 
     qpos: np.ndarray
@@ -44,76 +44,86 @@ class _Plan(NamedTuple):
     is_taken: np.ndarray
 
 
-def make_video(
+def make_film(
     out: Path,
     state: TrainState,
     config: Config,
     motion: Literal["dynamic", "kinematic"],
-    seed: int | None,
+    episode: int | None,
     height: int = HEIGHT,
 ) -> str:
-    """Films one search by the first policy of a run and returns a line to tell.
+    """Films one search by the first policy of a run, and writes the film as an .mp4 file.
 
-    The arm's motions are in real time; the film stands a while at each view whose picture is taken.
+    The arm moves in real time. The film holds each view whose image the policy uses.
 
     Args:
-      out: the file, ending in .mp4.
-      state: of a finished run.
-      config: the run's.
-      motion: the arm as its dynamics move it, or exactly on the planned paths.
-      seed: of a random initial view and target; None for the search that the run's report shows.
-      height: of the film, in pixels; a multiple of 18, so that its width is a whole, even number.
+      out: the new file; its name ends in .mp4.
+      state: state of a finished run.
+      config: the run's config.
+      motion: "dynamic" shows the arm as its dynamics move it, "kinematic" exactly on the planned paths.
+      episode: number of a random episode, 0 to `MAX_SEED`, which gives initial view and target; None for the search of
+        the run's report.
+      height: height of the film in pixels; a multiple of 18, so that the width is whole and even.
+
+    Returns:
+      A line for the user: file, length and result of the search.
 
     Raises:
-      ConfigError: the seed is out of range.
-      PlanningError, SceneError: the arm's model has no speed limits, or no actuators for dynamic motion.
-      FilmError: a motion is too long for a film, or the encoder stopped, as it does on a full disk.
+      ConfigError: the episode is out of range.
+      PlanningError: a joint of the arm has no speed limit.
+      SceneError: motion is dynamic, and a joint of the arm has no position actuator.
+      FilmError: ffmpeg is not installed, a motion is too long for a film, or the encoder stopped, for example on a
+        full disk.
     """
-    if seed is not None and not 0 <= seed <= MAX_SEED:
-        raise ConfigError(f"seed is {seed}; allowed: 0 to {MAX_SEED}")
-    find_ffmpeg()  # now, not when the search is done
+    if episode is not None and not 0 <= episode <= MAX_SEED:
+        raise ConfigError(f"--episode is {episode}; allowed: 0 to {MAX_SEED}")
+    find_ffmpeg()  # before the search, so that a missing ffmpeg is reported at once
     config = dataclasses.replace(config, env=dataclasses.replace(config.env, reachable="path", motion=motion))
-    key = None if seed is None else jax.random.key(seed)
-    search: FilmedSearch = jax.tree.map(np.asarray, call_interruptibly(film_search, state, key, config))
-    longest = float(search.seconds.max())
-    if longest > MOST_SECONDS:
+    key = None if episode is None else jax.random.key(episode)
+    search: FilmedSearch = jax.tree.map(np.asarray, call_interruptibly(record_motions, state, key, config))
+    longest = float(search.durations.max())
+    if longest > MAX_SECONDS:
         raise FilmError(
-            f"a motion takes {longest:.0f} s and a film holds {MOST_SECONDS} s of each at most; film another search "
-            "with --seed, or raise the speeds (`user` of the joints) in the arm's file"
+            f"a motion takes {longest:.0f} s, but a film shows at most {MAX_SECONDS} s of each motion; film another "
+            "search with --episode, or raise the speed limits (`user` of the joints) in the arm's file"
         )
-    plan = _plan(search)
-    frames = _frames(state, search, plan, config, height)
+    plan = _plan_frames(search)
+    frames = _draw_frames(state, search, plan, config, height)
     num_frames = write_film(out, frames, FPS, (height, height * 16 // 9))
-    ending = "found" if search.is_found else "not found"
-    return f"wrote {out}: {num_frames / FPS:.1f} s, the target is {ending} after {int(search.num_steps)} steps"
+    result = "found" if search.is_found else "not found"
+    return f"wrote {out}: {num_frames / FPS:.1f} s, the target is {result} after {int(search.num_steps)} steps"
 
 
-def _plan(search: FilmedSearch) -> _Plan:
-    counts = np.maximum(np.ceil(search.seconds * FPS), 1).astype(int)[: int(search.num_steps)]
-    motions = [joints[:count] for joints, count in zip(search.joints, counts, strict=False)]
+def _plan_frames(search: FilmedSearch) -> _Plan:
+    """Cuts each motion to its duration and joins them."""
+    counts = np.maximum(np.ceil(search.durations * FPS), 1).astype(int)[: int(search.num_steps)]
+    motions = [qpos[:count] for qpos, count in zip(search.qpos, counts, strict=False)]
     is_taken = np.zeros(1 + counts.sum(), bool)
     is_taken[np.cumsum([0, *counts])] = True
     steps = np.repeat(np.arange(1 + len(counts)), [1, *counts])
-    return _Plan(np.concatenate([search.start[None], *motions]), steps, is_taken)
+    return _Plan(np.concatenate([search.start_qpos[None], *motions]), steps, is_taken)
 
 
-def _frames(state: TrainState, search: FilmedSearch, plan: _Plan, config: Config, height: int) -> Iterator[np.ndarray]:
-    """Yields the film's frames, u8[H, W, 3]."""
+def _draw_frames(
+    state: TrainState, search: FilmedSearch, plan: _Plan, config: Config, height: int
+) -> Iterator[np.ndarray]:
+    """Yields the film's frames, u8[H, W, 3], holds included."""
     last = len(plan.qpos) - 1
-    target_picture, pictures = _pictures(state, search, plan, config, height)
-    lowest = max(float(search.similarity.min()) - _BELOW, -1.05)
-    page = FilmPage(target_picture, (max(last, 1) / FPS, lowest), config.env.threshold, height)
-    for number, seen in enumerate(pictures):
+    target_image, rendered = _render(state, search, plan, config, height)
+    lowest = max(float(search.similarity.min()) - _AXIS_MARGIN, -1.05)
+    page = FilmPage(target_image, (max(last, 1) / FPS, lowest), config.env.threshold, height)
+    for number, images in enumerate(rendered):
+        is_taken = bool(plan.is_taken[number])
         moment = Moment(
-            overview=np.asarray(seen.overview),
-            wrist=np.asarray(seen.wrist),
+            overview=np.asarray(images.overview),
+            wrist=np.asarray(images.wrist),
             time=number / FPS,
-            similarity=float(seen.similarity),
-            view_deg=(float(np.rad2deg(seen.view.azimuth)) % 360.0, float(np.rad2deg(seen.view.elevation))),
-            caption=_caption(search, int(plan.steps[number]), bool(plan.is_taken[number])),
-            is_taken=bool(plan.is_taken[number]),
+            similarity=float(images.similarity),
+            view_deg=(float(np.rad2deg(images.view.azimuth)) % 360.0, float(np.rad2deg(images.view.elevation))),
+            caption=_caption(search, int(plan.steps[number]), is_taken),
+            is_taken=is_taken,
         )
-        hold = (END_SECONDS if number == last else HOLD_SECONDS) if moment.is_taken else 0.0
+        hold = (END_SECONDS if number == last else HOLD_SECONDS) if is_taken else 0.0
         frame = page.draw(moment)
         for _ in range(1 + round(hold * FPS)):
             yield frame
@@ -124,30 +134,31 @@ def _caption(search: FilmedSearch, step: int, is_taken: bool) -> str:
         return "start"
     name = f"step {step}"
     if not search.is_reachable[step - 1]:
-        return f"{name}: out of reach, the arm stays"
+        return f"{name}: out of reach, the arm does not move"
     if not is_taken:
         return name
     if step < search.num_steps:
-        return f"{name}: a picture is taken"
-    return f"{name}: found" if search.is_found else f"{name}: not found, the steps are used up"
+        return f"{name}: image taken"
+    return f"{name}: found" if search.is_found else f"{name}: not found, no steps are left"
 
 
-def _pictures(
+def _render(
     state: TrainState, search: FilmedSearch, plan: _Plan, config: Config, height: int
 ) -> tuple[np.ndarray, Iterator[Frames]]:
-    """Returns the target picture u8[h, h, 3] and, one by one, what is seen in each frame."""
+    """Returns the target image u8[h, h, 3] and an iterator over the rendered frames, one by one."""
     size = (height, height * 8 // 9)
-    # The target's picture is one more frame, so that nothing is compiled for it alone.
+    # The target is rendered as one more frame, since a call for it alone would be compiled anew.
     qpos = np.concatenate([search.target.qpos[None], plan.qpos])
     camera = overview_camera(build_scene(config.scene), plan.qpos, size)
 
-    def looks() -> Iterator[Frames]:
-        for first in range(0, len(qpos), _CHUNK):
-            index = np.minimum(np.arange(first, first + _CHUNK), len(qpos) - 1)
-            seen = call_interruptibly(look_along, state, qpos[index], search.target, camera, config, size)
-            frames = jax.tree.map(np.asarray, seen)
-            for place in range(min(_CHUNK, len(qpos) - first)):
-                yield jax.tree.map(lambda x, i=place: x[i], frames)
+    def render_in_chunks() -> Iterator[Frames]:
+        for first in range(0, len(qpos), _CHUNK_SIZE):
+            # The last chunk repeats the last frame to keep its shape.
+            index = np.minimum(np.arange(first, first + _CHUNK_SIZE), len(qpos) - 1)
+            chunk = call_interruptibly(render_frames, state, qpos[index], search.target, camera, config, size)
+            chunk = jax.tree.map(np.asarray, chunk)
+            for i in range(min(_CHUNK_SIZE, len(qpos) - first)):
+                yield jax.tree.map(lambda x, i=i: x[i], chunk)
 
-    pictures = looks()
-    return np.asarray(next(pictures).wrist), pictures
+    rendered = render_in_chunks()
+    return np.asarray(next(rendered).wrist), rendered

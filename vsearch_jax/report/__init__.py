@@ -1,19 +1,19 @@
-"""Results, table, figures and page of a run, each with the thesis's figures beside ours."""
+"""Report of a run: results.json, table, figures and HTML page. Each shows the thesis's values beside ours."""
 
-from vsearch_jax.report.figures import mount_heights, reachability, search_strip
-from vsearch_jax.report.page import draw, to_png, write, write_report
-from vsearch_jax.report.summary import SEARCHERS, results
+from vsearch_jax.report.figures import draw_mount_heights, draw_reachability, draw_search_strip
+from vsearch_jax.report.page import draw_figures, to_png, write_files, write_report
+from vsearch_jax.report.summary import SEARCHERS, summarize_results
 from vsearch_jax.report.table import print_table
 
 __all__ = [
     "SEARCHERS",
-    "draw",
-    "mount_heights",
+    "draw_figures",
+    "draw_mount_heights",
+    "draw_reachability",
+    "draw_search_strip",
     "print_table",
-    "reachability",
-    "results",
-    "search_strip",
+    "summarize_results",
     "to_png",
-    "write",
+    "write_files",
     "write_report",
 ]

@@ -1,9 +1,8 @@
-"""The figures of a run, each a function from arrays to a matplotlib figure, the thesis's values drawn beside ours."""
+"""Figures of a run: functions from arrays to matplotlib figures, with the thesis's values beside ours."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,26 +12,26 @@ from matplotlib.patches import Patch
 
 from vsearch_jax.config import Config
 from vsearch_jax.report.style import COLORS, INK, REACHABLE, THESIS_COLOR, UNREACHABLE, styled
-from vsearch_jax.report.summary import SEARCHERS
-from vsearch_jax.report.thesis import THESIS
+from vsearch_jax.report.summary import SEARCHERS, Results, Trials
+from vsearch_jax.report.thesis import thesis_range
 from vsearch_jax.types import ReachabilityMap
 
 THESIS_BAND_DEG = (40, 70)
-"""Elevations that the thesis's arm reached at every azimuth."""
+"""Elevations in degrees that the thesis's arm reached at every azimuth."""
 
 
 @styled
-def reachability(reach: ReachabilityMap, wanted_deg: tuple[float, float] | None = None) -> Figure:
-    """Draws which views the arm can reach, and the band that it reaches at every azimuth.
+def draw_reachability(reach: ReachabilityMap, wanted_deg: tuple[float, float] | None = None) -> Figure:
+    """Draws a map of the views that the arm reaches, and the range of elevations that it reaches at every azimuth.
 
     Args:
-      reach: the map.
-      wanted_deg: lowest and highest elevation that are wanted, in degrees; the thesis's band by default.
+      reach: the views that the arm reaches.
+      wanted_deg: lowest and highest wanted elevation in degrees; the thesis's band by default.
     """
     azimuths, elevations = np.rad2deg(reach.azimuths), np.rad2deg(reach.elevations)
     figure = Figure(figsize=(8, 3.6))
     axes = figure.add_subplot()
-    # A cell is centred on its view.
+    # A view is the centre of its cell.
     half = 0.5 * np.array([360.0 / len(azimuths), elevations[1] - elevations[0]])
     extent = (azimuths[0] - half[0], azimuths[-1] + half[0], elevations[0] - half[1], elevations[-1] + half[1])
     axes.imshow(
@@ -62,39 +61,46 @@ def reachability(reach: ReachabilityMap, wanted_deg: tuple[float, float] | None 
 
 
 @styled
-def mount_heights(heights: Sequence[float], coverages: Sequence[float], best: float) -> Figure:
-    """Draws the share of the wanted views that the arm reaches, against the height (m) of its mount."""
+def draw_mount_heights(heights: Sequence[float], coverages: Sequence[float], best: float) -> Figure:
+    """Draws the share of the wanted views that the arm reaches, for several heights of the arm's mount.
+
+    Args:
+      heights: mount heights in m.
+      coverages: for each height, the share of the wanted views that the arm reaches, in [0, 1].
+      best: best mount height in m; it is marked.
+    """
     figure = Figure(figsize=(6, 3.2))
     axes = figure.add_subplot()
     axes.plot(heights, 100.0 * np.asarray(coverages), marker="o", markersize=3)
     axes.axvline(best, linestyle=":", color="black")
-    axes.set(xlabel="mount height (m)", ylabel="wanted views in reach (%)", ylim=(-3, 103))
+    axes.set(xlabel="mount height (m)", ylabel="reachable wanted views (%)", ylim=(-3, 103))
     axes.set_title(f"Best mount height: {best:.2f} m")
     return figure
 
 
 @styled
-def training(lines: Sequence[Mapping[str, Any]], config: Config) -> Figure:
-    """Draws losses, reward, success and temperature over training.
+def draw_training(lines: Sequence[Mapping[str, float | str]], config: Config) -> Figure:
+    """Draws how losses, reward, success rate and temperature change over the training.
 
     Args:
-      lines: the lines of metrics.jsonl.
+      lines: lines of metrics.jsonl, one for each iteration.
       config: the run's config.
     """
     figure = Figure(figsize=(10, 5.6))
     panels = figure.subplots(2, 3)
-    policy = [("reward", "reward of a step"), ("success_rate", "success of ended episodes")]
+    policy = [("reward", "reward of a step"), ("success_rate", "success rate of ended episodes")]
     policy += [("critic_loss", "critic loss"), ("actor_loss", "actor loss"), ("alpha", "temperature α")]
-    _curve(panels.flat[0], lines, "encoder_loss", config, COLORS["cma_es"])
+    _plot_metric(panels.flat[0], lines, "encoder_loss", config, COLORS["cma_es"])
     panels.flat[0].set(xlabel="encoder updates", ylabel="bootstrapped L2 loss", yscale="log")
     for axes, (name, label) in zip(panels.flat[1:], policy, strict=True):
-        _curve(axes, lines, name, config, COLORS["sac"])
+        _plot_metric(axes, lines, name, config, COLORS["sac"])
         axes.set(xlabel="environment steps of a policy", ylabel=label)
-    figure.suptitle("Training: each iteration and its running mean", x=0.01, ha="left")
+    figure.suptitle("Training: values of each iteration, and their running mean", x=0.01, ha="left")
     return figure
 
 
-def _curve(axes: Axes, lines: Sequence[Mapping[str, Any]], name: str, config: Config, color: str) -> None:
+def _plot_metric(axes: Axes, lines: Sequence[Mapping[str, float | str]], name: str, config: Config, color: str) -> None:
+    """Plots metric `name` and its running mean. Plots nothing if no line holds it."""
     points = [(line["iteration"], line[name]) for line in lines if name in line]
     if not points:
         return
@@ -108,88 +114,84 @@ def _curve(axes: Axes, lines: Sequence[Mapping[str, Any]], name: str, config: Co
 
 
 @styled
-def search_progress(name: str, trials: Mapping[str, Any], samples: int, threshold: float) -> Figure:
-    """Draws the best cosine so far over images taken, of every trial, and how many trials have ended.
+def draw_search_progress(name: str, trials: Trials, num_samples: int, threshold: float) -> Figure:
+    """Draws a searcher's progress over the number of images: best cosine of each trial, share of successful trials.
 
     Args:
-      name: random_search or cma_es.
-      trials: arrays [N] of `evaluate`.
-      samples: images of a generation.
+      name: the searcher, "random_search" or "cma_es".
+      trials: measures of this searcher from `evaluate`, arrays with one entry for each of N trials (searches).
+      num_samples: number of images of a generation (images that the searcher asks for at once).
       threshold: cosine at which a search ends.
     """
-    best = np.asarray(trials["best_scores"])
-    evaluations = np.asarray(trials["evaluations"])
-    is_success = np.asarray(trials["is_success"])
+    best, evaluations = trials["best_scores"], trials["evaluations"]
     figure = Figure(figsize=(8, 4.6))
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    images = 1 + samples * np.arange(1, best.shape[1] + 1)  # the first is that of the initial view
+    images = 1 + num_samples * np.arange(1, best.shape[1] + 1)  # the initial view is one image
     for scores, count in zip(best, evaluations, strict=True):
-        end = int(np.ceil((count - 1) / samples))
+        end = int(np.ceil((count - 1) / num_samples))
         upper.plot(images[:end], scores[:end], color=COLORS[name], alpha=0.2, linewidth=0.9)
     upper.plot(images, np.median(best, axis=0), color=INK, label="median")
     upper.axhline(threshold, color=INK, linestyle=":", linewidth=1.2, label=f"threshold {threshold:g}")
-    low, high = THESIS[name]["evaluations_mean"]
+    low, high = thesis_range(name, "evaluations_mean")
+    label = f"thesis: {low:g}–{high:g} images, mean"
     for axes in (upper, lower):
-        axes.axvspan(low, high, color=THESIS_COLOR, alpha=0.25, linewidth=0, label=f"thesis: {low}–{high} images, mean")
+        axes.axvspan(low, high, color=THESIS_COLOR, alpha=0.25, linewidth=0, label=label)
     mean = evaluations.mean()
     upper.axvline(mean, color=COLORS[name], linestyle="--", label=f"ours: {mean:.1f} images, mean")
     upper.set(ylabel="best cosine so far", title=f"{SEARCHERS[name]}: {len(best)} trials")
     upper.legend(loc="lower right")
-    ends = np.sort(evaluations[is_success])
+    ends = np.sort(evaluations[trials["is_success"]])
     share = 100.0 * np.arange(1, len(ends) + 1) / len(best)
     lower.step([0, *ends, images[-1]], [0, *share, share[-1] if len(share) else 0], where="post", color=COLORS[name])
-    lower.axhline(100 * THESIS[name]["success_rate"], color=THESIS_COLOR, linestyle="--", linewidth=1.2)
+    success_rate, _ = thesis_range(name, "success_rate")
+    lower.axhline(100 * success_rate, color=THESIS_COLOR, linestyle="--", linewidth=1.2)
     lower.set(xlabel="images taken", ylabel="found (%)", ylim=(0, 105), xlim=(0, images[-1]))
     return figure
 
 
 @styled
-def policy_episodes(trials: Mapping[str, Any]) -> Figure:
-    """Draws the evaluation of the policies: steps beside their lower bound, and pose errors.
+def draw_policy_episodes(trials: Trials) -> Figure:
+    """Draws the evaluation of the policies: number of steps against the lower bound, and the errors of the final poses.
 
     Args:
-      trials: arrays [S, N] of `evaluate`, all seeds.
+      trials: measures of `sac` from `evaluate`, arrays of [policy seeds, episodes].
     """
-    steps = np.asarray(trials["evaluations"]).ravel()
-    bound = np.asarray(trials["steps_lower_bound"]).ravel()
+    steps, bound = trials["evaluations"].ravel(), trials["steps_lower_bound"].ravel()
     figure = Figure(figsize=(10, 3.6))
     counts, rotation, translation = figure.subplots(1, 3, width_ratios=(1.6, 1, 1))
     numbers = np.arange(1, max(steps.max(), bound.max()) + 1)
     share = [100.0 * np.bincount(x, minlength=numbers[-1] + 1)[1:] / x.size for x in (steps, bound)]
     counts.bar(numbers - 0.2, share[0], 0.4, color=COLORS["sac"], label=f"ours, mean {steps.mean():.2f}")
-    counts.bar(numbers + 0.2, share[1], 0.4, color="#b9d8cd", label=f"fewest possible, mean {bound.mean():.2f}")
-    counts.axvline(THESIS["sac"]["evaluations_mean"], color=THESIS_COLOR, linestyle="--", label="thesis, mean 4")
-    counts.set(
-        xlabel="steps of an episode", ylabel="episodes (%)", title=f"{steps.size} episodes, views and targets random"
-    )
+    counts.bar(numbers + 0.2, share[1], 0.4, color="#b9d8cd", label=f"lower bound, mean {bound.mean():.2f}")
+    thesis_mean, _ = thesis_range("sac", "evaluations_mean")
+    counts.axvline(thesis_mean, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis_mean:g}")
+    title = f"{steps.size} episodes, random views and targets"
+    counts.set(xlabel="steps of an episode", ylabel="episodes (%)", title=title)
     counts.legend(loc="upper right")
-    errors = {
-        rotation: ("rotational error (°)", np.rad2deg(trials["rotation_error"]), "rotation_error_deg_mean", "°"),
-        translation: (
-            "translational error (cm)",
-            100 * trials["translation_error"],
-            "translation_error_cm_mean",
-            " cm",
-        ),
-    }
-    for axes, (label, values, key, unit) in errors.items():
-        values = np.asarray(values).ravel()
-        shown = np.clip(values, 0, np.percentile(values, 99))  # the last bar holds the rest
-        axes.hist(shown, 30, color=COLORS["sac"], weights=np.full(values.size, 100.0 / values.size))
-        axes.axvline(np.median(values), color=INK, linewidth=1.2, label=f"median {np.median(values):.2f}{unit}")
-        thesis = THESIS["sac"][key]
-        axes.axvline(thesis, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis}{unit}")
-        axes.set(xlabel=label, ylabel="episodes (%)")
-        axes.legend(loc="upper right")
+    degrees, centimetres = np.rad2deg(trials["rotation_error"]).ravel(), 100 * trials["translation_error"].ravel()
+    _plot_errors(rotation, degrees, "rotational error (°)", "°", thesis_range("sac", "rotation_error_deg_mean")[0])
+    thesis_mean, _ = thesis_range("sac", "translation_error_cm_mean")
+    _plot_errors(translation, centimetres, "translational error (cm)", " cm", thesis_mean)
     return figure
 
 
+def _plot_errors(axes: Axes, errors: np.ndarray, label: str, unit: str, thesis_mean: float) -> None:
+    """Plots a histogram of errors, their median and the thesis's mean."""
+    shown = np.clip(errors, 0, np.percentile(errors, 99))  # the last bar holds the largest errors too
+    axes.hist(shown, 30, color=COLORS["sac"], weights=np.full(errors.size, 100.0 / errors.size))
+    median = np.median(errors)
+    axes.axvline(float(median), color=INK, linewidth=1.2, label=f"median {median:.2f}{unit}")
+    axes.axvline(thesis_mean, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis_mean:g}{unit}")
+    axes.set(xlabel=label, ylabel="episodes (%)")
+    axes.legend(loc="upper right")
+
+
 @styled
-def comparison(results: Mapping[str, Any]) -> Figure:
-    """Draws ours beside the thesis's for every searcher: success, images, rotation, translation.
+def draw_comparison(results: Results) -> Figure:
+    """Draws success rate, number of images and pose errors of every searcher, ours beside the thesis's.
 
     Args:
-      results: what `results.json` holds.
+      results: content of `results.json`.
     """
     panels = {
         "success_rate": ("success (%)", 100.0),
@@ -199,38 +201,35 @@ def comparison(results: Mapping[str, Any]) -> Figure:
     }
     figure = Figure(figsize=(11, 3.4))
     for axes, (key, (label, scale)) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
-        for place, name in enumerate(SEARCHERS):
+        for position, name in enumerate(SEARCHERS):
             ours, interval = scale * results[name][key], results[name][f"{key}_ci95"]
-            axes.bar(place - 0.2, ours, 0.38, color=COLORS[name])
+            axes.bar(position - 0.2, ours, 0.38, color=COLORS[name])
             if interval is not None:
-                _whisker(axes, place - 0.2, scale * np.array(interval))
-            ends = scale * np.atleast_1d(THESIS[name][key])
-            axes.bar(place + 0.2, ends.mean(), 0.38, color=THESIS_COLOR, alpha=0.5, hatch="///", edgecolor="white")
-            if len(ends) > 1:
-                _whisker(axes, place + 0.2, ends)
+                _plot_interval(axes, position - 0.2, scale * np.array(interval))
+            low, high = (scale * value for value in thesis_range(name, key))
+            middle = 0.5 * (low + high)
+            axes.bar(position + 0.2, middle, 0.38, color=THESIS_COLOR, alpha=0.5, hatch="///", edgecolor="white")
+            if low < high:
+                _plot_interval(axes, position + 0.2, np.array([low, high]))
         axes.set_xticks(range(len(SEARCHERS)), ["random", "CMA-ES", "SAC"])
         axes.set(title=label)
         axes.grid(axis="x", visible=False)
-    figure.supxlabel(
-        "coloured: ours with 95 % intervals; hatched: thesis, with its range where it gives one", fontsize=9
-    )
+    figure.supxlabel("coloured: ours with 95 % intervals; hatched: thesis, with its range if it gives one", fontsize=9)
     return figure
 
 
-def _whisker(axes: Axes, place: float, ends: np.ndarray) -> None:
-    axes.plot([place, place], ends, color=INK, linewidth=1.2)
+def _plot_interval(axes: Axes, position: float, ends: np.ndarray) -> None:
+    axes.plot([position, position], ends, color=INK, linewidth=1.2)
 
 
 @styled
-def search_strip(images: np.ndarray, cosines: Sequence[float], target: np.ndarray) -> Figure:
-    """Draws what the camera saw at each step of a search, its cosine below, and the target image at the end.
-
-    Eight pictures stand in a row.
+def draw_search_strip(images: np.ndarray, cosines: Sequence[float], target: np.ndarray) -> Figure:
+    """Draws the images that one search took, with the cosine below each, and the target image at the end.
 
     Args:
-      images: f32[N, H, W, 3] in [0, 1].
-      cosines: N cosine similarities with the target.
-      target: f32[H, W, 3] in [0, 1].
+      images: f32[N, H, W, 3] in [0, 1], the N images of H x W pixels, the initial view first. A row holds eight.
+      cosines: similarity of each image to the target, N cosines.
+      target: target image, f32[H, W, 3] in [0, 1].
     """
     count = len(images) + 1
     columns, rows = min(count, 8), -(-count // 8)

@@ -1,4 +1,4 @@
-"""Writes a run's results.json, figures and a self-contained page that shows them."""
+"""Writes results.json, the figures and a self-contained HTML page of a run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import jinja2
 from matplotlib.figure import Figure
@@ -15,96 +14,107 @@ from matplotlib.figure import Figure
 from vsearch_jax.config import Config
 from vsearch_jax.report import figures
 from vsearch_jax.report.style import styled
-from vsearch_jax.report.summary import SEARCHERS, results
-from vsearch_jax.report.table import FOOTNOTE, regime, rows
-from vsearch_jax.runs import atomic
+from vsearch_jax.report.summary import SEARCHERS, Results, summarize_results, to_trials
+from vsearch_jax.report.table import FOOTNOTE, describe_motion, table_rows
+from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.loop import Evaluated
 
 CAPTIONS = {
-    "search": "A search by the policy, from the far side of the object",
-    "comparison": "The searchers side by side",
+    "search": "One search by the policy; it starts behind the object",
+    "comparison": "Comparison of the searchers",
     "random_search": "Random search",
     "cma_es": "CMA-ES",
     "sac_evaluation": "Soft actor-critic, evaluation",
     "training": "Training",
     "reachability": "Reachable views",
 }
-"""Figures of a run, by file name, in the order of the page."""
+"""Caption of each figure by file name, in the order of the page."""
 
 
-def write_report(folder: Path, evaluated: Evaluated, config: Config) -> dict[str, Any]:
-    """Writes results.json, figures/*.png and report.html into `folder`, over those that are there.
+def write_report(folder: Path, evaluated: Evaluated, config: Config) -> Results:
+    """Makes the report of a run: computes the results, draws the figures, and writes all files into `folder`.
+
+    The files are results.json, figures/*.png and report.html. Existing files of these names are replaced.
 
     Args:
-      folder: the run's folder, or another one.
-      evaluated: what `runs.evaluate_run` returned.
+      folder: an existing folder: the run's, or another one.
+      evaluated: measures of all searchers and of the training, from `runs.loop.evaluate_run`.
       config: the run's config.
 
     Returns:
-      What `results.json` holds.
+      Content of `results.json`.
 
     Raises:
       OSError: the disk is full or not writable.
     """
-    summary = results(evaluated.arrays, config, evaluated.wall_seconds) | {"seed": evaluated.seed}
-    write(folder, summary, draw(summary, evaluated, config), config)
-    return summary
+    results = summarize_results(evaluated.arrays, config, evaluated.wall_seconds) | {"seed": evaluated.seed}
+    write_files(folder, results, draw_figures(results, evaluated, config), config)
+    return results
 
 
-def draw(summary: Mapping[str, Any], evaluated: Evaluated, config: Config) -> dict[str, Figure]:
-    """Returns the figures named in `CAPTIONS`.
+def draw_figures(results: Results, evaluated: Evaluated, config: Config) -> dict[str, Figure]:
+    """Draws all figures of a run's report.
 
     Args:
-      summary: what `results.json` holds.
-      evaluated: what `runs.evaluate_run` returned.
+      results: content of `results.json`.
+      evaluated: measures of all searchers and of the training, from `runs.loop.evaluate_run`.
       config: the run's config.
+
+    Returns:
+      {file name: figure}; `CAPTIONS` has the same keys.
     """
-    arrays, search = evaluated.arrays, evaluated.search
-    threshold = config.env.threshold
-    samples = {"random_search": config.random_search.num_samples, "cma_es": config.cma_es.population}
-    progress = {name: figures.search_progress(name, arrays[name], samples[name], threshold) for name in samples}
-    seen = slice(0, int(search["num_steps"]) + 1)
+    trials = {name: to_trials(outcome) for name, outcome in evaluated.arrays.items()}
+    search, threshold = evaluated.search, config.env.threshold
+    num_samples = {"random_search": config.random_search.num_samples, "cma_es": config.cma_es.population}
+    progress = {
+        name: figures.draw_search_progress(name, trials[name], num_samples[name], threshold) for name in num_samples
+    }
+    shown = slice(0, int(search["num_steps"]) + 1)
+    cosines = search["similarity"][shown].tolist()
     return {
-        "search": figures.search_strip(search["images"][seen], search["similarity"][seen].tolist(), search["target"]),
-        "comparison": figures.comparison(summary),
+        "search": figures.draw_search_strip(search["images"][shown], cosines, search["target"]),
+        "comparison": figures.draw_comparison(results),
         **progress,
-        "sac_evaluation": figures.policy_episodes(arrays["sac"]),
-        "training": figures.training(evaluated.lines, config),
-        "reachability": figures.reachability(evaluated.reach),
+        "sac_evaluation": figures.draw_policy_episodes(trials["sac"]),
+        "training": figures.draw_training(evaluated.lines, config),
+        "reachability": figures.draw_reachability(evaluated.reach),
     }
 
 
-def write(folder: Path, summary: Mapping[str, Any], pictures: Mapping[str, Figure], config: Config) -> None:
-    """Writes results.json, figures/*.png and report.html into `folder`, over those that are there.
+def write_files(folder: Path, results: Results, pictures: Mapping[str, Figure], config: Config) -> None:
+    """Writes results and figures that are already computed as results.json, figures/*.png and report.html.
+
+    Existing files of these names are replaced.
 
     Args:
-      folder: the run's folder.
-      summary: what `results.json` is to hold.
-      pictures: figures by file name, from `draw`.
+      folder: an existing folder, for all files.
+      results: content of `results.json`.
+      pictures: figures by file name, from `draw_figures`.
       config: the run's config.
 
     Raises:
       OSError: the disk is full or not writable.
+      ValueError: `results` holds NaN or infinity; nothing is written then.
     """
-    text = json.dumps(summary, indent=2, allow_nan=False) + "\n"  # before anything is written over
+    text = json.dumps(results, indent=2, allow_nan=False) + "\n"  # first: it may raise
     (folder / "figures").mkdir(exist_ok=True)
     images = {name: to_png(picture) for name, picture in pictures.items()}
     for name, image in images.items():
-        atomic.write_atomically(folder / "figures" / f"{name}.png", image)
-    atomic.write_atomically(folder / "report.html", _page(folder.absolute().name, summary, images, config))
-    # The last one: where it is, the report is whole.
-    atomic.write_atomically(folder / "results.json", text)
+        write_atomically(folder / "figures" / f"{name}.png", image)
+    write_atomically(folder / "report.html", _render_page(folder.absolute().name, results, images, config))
+    # Last: a report with results.json is complete.
+    write_atomically(folder / "results.json", text)
 
 
 @styled
 def to_png(picture: Figure) -> bytes:
-    """Returns the picture as a PNG file."""
+    """Converts a matplotlib figure to the bytes of a PNG file."""
     buffer = io.BytesIO()
     picture.savefig(buffer, format="png")
     return buffer.getvalue()
 
 
-def _page(title: str, summary: Mapping[str, Any], images: Mapping[str, bytes], config: Config) -> str:
+def _render_page(title: str, results: Results, images: Mapping[str, bytes], config: Config) -> str:
     loader = jinja2.PackageLoader("vsearch_jax.report", "")
     template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined).get_template(
         "page.html"
@@ -113,11 +123,11 @@ def _page(title: str, summary: Mapping[str, Any], images: Mapping[str, bytes], c
     return template.render(
         title=title,
         searchers=SEARCHERS.values(),
-        rows=rows(summary),
+        rows=table_rows(results),
         footnote=FOOTNOTE,
-        how=regime(summary),
-        seeds=summary["sac"]["seeds"],
+        motion=describe_motion(results),
+        seeds=results["sac"]["seeds"],
         pictures=pictures,
-        results=summary,
+        results=results,
         config=json.dumps(config.to_dict(), indent=2),
     )

@@ -1,47 +1,57 @@
-"""From the raw arrays of `evaluate` to the numbers of `results.json`."""
+"""Turns the arrays of `evaluate` into the numbers of `results.json`."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import platform
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
 import scipy.stats
 
 from vsearch_jax.config import Config
+from vsearch_jax.evaluation import Outcome
 from vsearch_jax.report.thesis import THESIS
+from vsearch_jax.types import View
 
 SEARCHERS = {"random_search": "Random search", "cma_es": "CMA-ES", "sac": "Soft actor-critic"}
-"""Keys of the searchers in `results.json`, and what people call them."""
+"""Display name of each searcher, by its key in `results.json`."""
+
+Results: TypeAlias = dict[str, Any]  # nested JSON: its type depends on the key
+"""Content of `results.json`: plain values; the keys hold the units."""
+
+Trials: TypeAlias = Mapping[str, np.ndarray]
+"""Measures of one searcher, by name: arrays of [trials] or [seeds, episodes]."""
 
 _PACKAGES = ("vsearch_jax", "jax", "jaxlib", "flax", "optax", "brax", "evosax", "mujoco", "mujoco-mjx", "numpy")
 _NUM_RESAMPLES = 2000
 
 
-def results(arrays: Mapping[str, Any], config: Config, wall_seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Returns what `results.json` holds: plain values, units in the names.
+def summarize_results(arrays: Mapping[str, Outcome], config: Config, wall_seconds: Mapping[str, float]) -> Results:
+    """Computes the content of `results.json`: rates and means of the measures of each searcher, versions, machine.
 
-    Rates have Wilson's 95 % interval under `..._ci95`, means a bootstrapped one (None for a single episode). For `sac`
-    the top level pools the episodes of all seeds; `seeds` lists each.
+    A rate has Wilson's 95 % interval, a mean has a bootstrap 95 % interval. The keys of intervals end in `_ci95`. The
+    interval of a mean is None for a single trial. For `sac` the top level pools the episodes of all policy seeds, and
+    `seeds` lists each seed.
 
     Args:
-      arrays: what `evaluate` returned.
+      arrays: measures of each searcher, from `evaluate`.
       config: the run's config.
-      wall_seconds: wall time of each stage of the run.
+      wall_seconds: wall time in s of each stage of the run.
     """
-    searchers = {name: summarize(jax.tree.map(np.asarray, arrays[name])) for name in ("random_search", "cma_es")}
-    policies = jax.tree.map(np.asarray, arrays["sac"])
-    pooled = summarize(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), policies))
+    trials = {name: to_trials(outcome) for name, outcome in arrays.items()}
+    policies = trials["sac"]
+    pooled = summarize_trials(_map_arrays(lambda x: x.reshape(-1, *x.shape[2:]), policies))
     seeds = [
-        {"seed": seed, **summarize(jax.tree.map(lambda x, s=seed: x[s], policies))}
+        {"seed": seed, **summarize_trials(_map_arrays(lambda x, s=seed: x[s], policies))}
         for seed in range(policies["is_success"].shape[0])
     ]
     pooled |= {"environment_steps": config.sac.num_environment_steps, "seeds": seeds}
     return {
-        **searchers,
+        "random_search": summarize_trials(trials["random_search"]),
+        "cma_es": summarize_trials(trials["cma_es"]),
         "sac": pooled,
         "reachable": config.env.reachable,
         "motion": config.env.motion,
@@ -57,11 +67,19 @@ def results(arrays: Mapping[str, Any], config: Config, wall_seconds: Mapping[str
     }
 
 
-def summarize(trials: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the measures of the thesis (3.6) over trials.
+def to_trials(outcome: Outcome) -> Trials:
+    """Converts the measures of one searcher from JAX to numpy arrays by name. Initial and target views are left out."""
+    return {name: np.asarray(array) for name, array in outcome.items() if not isinstance(array, View)}
+
+
+def summarize_trials(trials: Trials) -> Results:
+    """Computes rates, means and percentiles over all trials (searches) of one searcher, as in thesis 3.6.
 
     Args:
-      trials: arrays [N] of `evaluate` for one searcher.
+      trials: measures of one searcher by name, arrays with one entry for each trial.
+
+    Returns:
+      The part of `results.json` for this searcher.
     """
     rotation = np.rad2deg(trials["rotation_error"])
     evaluations = trials["evaluations"]
@@ -91,21 +109,28 @@ def summarize(trials: Mapping[str, Any]) -> dict[str, Any]:
     return summary
 
 
-def _rate(name: str, count: Any, total: Any) -> dict[str, Any]:
+def _map_arrays(function: Callable[[np.ndarray], np.ndarray], trials: Trials) -> Trials:
+    return {name: function(array) for name, array in trials.items()}
+
+
+def _rate(name: str, count: int | np.integer, total: int | np.integer) -> Results:
     """Returns a rate with Wilson's score interval (Wilson 1927)."""
     interval = scipy.stats.binomtest(int(count), int(total)).proportion_ci(0.95, method="wilson")
     return {name: int(count) / int(total), f"{name}_ci95": [float(interval.low), float(interval.high)]}
 
 
-def _mean(name: str, values: np.ndarray) -> dict[str, Any]:
-    """Returns a mean with the bootstrap's percentile interval; none where there is one value, no mean of NaN or inf."""
+def _mean(name: str, values: np.ndarray) -> Results:
+    """Returns a mean with its bootstrap percentile interval.
+
+    The interval is None for a single value. Both are None where a value is NaN or infinite.
+    """
     values = np.asarray(values, np.float64)
-    # An arm without speed limits has no times, a search that never got to a view no cosine.
+    # An arm without speed limits has no motion times. A search that reached no view has no cosine.
     if not np.isfinite(values).all():
         return {name: None, f"{name}_ci95": None}
     interval = None
     if values.size > 1:
-        # The same resamples in each run, so that the report of a run does not change when it is made again.
+        # A fixed seed, so that two reports of one run are equal.
         found = scipy.stats.bootstrap(
             (values,), np.mean, n_resamples=_NUM_RESAMPLES, batch=100, method="percentile", rng=np.random.default_rng(0)
         ).confidence_interval

@@ -1,13 +1,11 @@
-"""The thesis's own figures, under the names of `results.json`; [low, high] where it gives a range.
+"""The thesis's published values, under the keys of `results.json`. A list is a range [low, high].
 
-Its means for random search and CMA-ES are over the trials that met the threshold; ours are over all trials.
+The thesis's means for random search and CMA-ES cover only the trials that met the threshold. Ours cover all trials.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-THESIS: dict[str, dict[str, Any]] = {
+THESIS: dict[str, dict[str, float | list[float]]] = {
     # Sections 5.1 and 5.3: 10 runs of 12 initial views, k = 1.5.
     "random_search": {
         "success_rate": 0.95,
@@ -37,3 +35,18 @@ THESIS: dict[str, dict[str, Any]] = {
         "environment_steps": 11_000,
     },
 }
+
+
+def thesis_range(searcher: str, key: str) -> tuple[float, float]:
+    """Returns the thesis's published value of one measure as (lowest, highest). A single value is returned twice.
+
+    Args:
+      searcher: the searcher, for example "sac"; a key of `THESIS`.
+      key: the measure, for example "success_rate"; a key of `results.json`.
+
+    Raises:
+      KeyError: the thesis does not give the value.
+    """
+    value = THESIS[searcher][key]
+    low, high = value if isinstance(value, list) else (value, value)
+    return low, high
