@@ -22,19 +22,19 @@ from vsearch_jax.types import Image
 NUM_JOINTS = 9
 
 
-def configured(kind: str) -> Config:
+def make_config(kind: str) -> Config:
     config = Config.preset("smoke")
     encoder = dataclasses.replace(config.encoder, input=kind)
     return dataclasses.replace(config, encoder=encoder, sac=dataclasses.replace(config.sac, num_seeds=2))
 
 
-def trained(config: Config) -> Any:
-    """The parts of a TrainState that an export reads, at random."""
+def random_state(config: Config) -> Any:
+    """Returns the parts of a TrainState that an export reads, with random values."""
     observation_size = 2 * config.encoder.code_size + NUM_JOINTS
     keys = jax.random.split(jax.random.key(1), config.sac.num_seeds)
     encoder = encoders.init(jax.random.key(0), config)
     return SimpleNamespace(
-        encoder=encoder.replace(latent_mean=0.1 * jax.random.normal(keys[0], encoder.latent_mean.shape)),
+        encoder=dataclasses.replace(encoder, latent_mean=0.1 * jax.random.normal(keys[0], encoder.latent_mean.shape)),
         sac=jax.vmap(lambda key: sac.init(key, config.sac, observation_size, 2))(keys),
         pool=SimpleNamespace(qpos=jnp.zeros((5, NUM_JOINTS)), camera=SimpleNamespace(fovy=jnp.full(5, 0.5))),
         reach=made_up.reach(),
@@ -42,7 +42,7 @@ def trained(config: Config) -> Any:
 
 
 def pictures(kind: str, count: int, size: int) -> tuple[np.ndarray, Image]:
-    """Pictures as a camera gives them, and the same as the renderer does."""
+    """Returns random images as a camera gives them, and as an Image of the renderer."""
     random = np.random.default_rng(0)
     rgb = random.integers(0, 256, (count, size, size, 3), dtype=np.uint8)
     depth = random.uniform(0.1, 0.6, (count, size, size)).astype(np.float32)
@@ -53,10 +53,10 @@ def pictures(kind: str, count: int, size: int) -> tuple[np.ndarray, Image]:
 
 
 @pytest.mark.parametrize("kind", ["rgb", "depth", "silhouette"])
-def test_what_is_read_back_equals_the_direct_call(tmp_path: Path, kind: str) -> None:
-    config = configured(kind)
-    state = trained(config)
-    export(tmp_path, state, config, seed=1)
+def test_the_exported_functions_equal_the_direct_call(tmp_path: Path, kind: str) -> None:
+    config = make_config(kind)
+    state = random_state(config)
+    export(tmp_path, state, config, policy=1)
     loaded = {
         name: jax.export.deserialize(bytearray((tmp_path / f"{name}.stablehlo").read_bytes()))
         for name in ("encoder", "policy")
@@ -67,7 +67,7 @@ def test_what_is_read_back_equals_the_direct_call(tmp_path: Path, kind: str) -> 
         code = encoders.encode(state.encoder, encoders.network_input(image, jnp.asarray([7]), config), config)
         return code, sac.act(None, actor, jnp.concatenate([code, target, qpos]), config.sac)
 
-    for count in (1, 3):  # a batch of any size
+    for count in (1, 3):  # The batch may have any size.
         picture, image = pictures(kind, count, config.scene.image_size)
         target = jax.random.normal(jax.random.key(2), (count, config.encoder.code_size))
         qpos = jax.random.normal(jax.random.key(3), (count, NUM_JOINTS))
@@ -79,9 +79,9 @@ def test_what_is_read_back_equals_the_direct_call(tmp_path: Path, kind: str) -> 
         np.testing.assert_allclose(similarity, np.sum(code * target, axis=-1) / norms, atol=1e-4)
 
 
-def test_interface_describes_the_files_and_they_need_no_package(tmp_path: Path) -> None:
-    config = configured("rgb")
-    export(tmp_path, trained(config), config)
+def test_the_interface_describes_the_files_and_they_run_without_the_package(tmp_path: Path) -> None:
+    config = make_config("rgb")
+    export(tmp_path, random_state(config), config)
     about = json.loads((tmp_path / "interface.json").read_text())
     size = config.scene.image_size
     assert about["functions"]["encoder"]["inputs"] == [
@@ -98,8 +98,8 @@ def test_interface_describes_the_files_and_they_need_no_package(tmp_path: Path) 
     assert done.stdout.strip() == f"(2, {config.encoder.code_size}) False"
 
 
-def test_a_policy_that_is_not_there_is_named(tmp_path: Path) -> None:
-    config = configured("rgb")
+def test_a_policy_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    config = make_config("rgb")
     with pytest.raises(ConfigError, match="policy 2 does not exist; allowed: 0 to 1"):
-        export(tmp_path, trained(config), config, seed=2)
+        export(tmp_path, random_state(config), config, policy=2)
     assert not any(tmp_path.iterdir())

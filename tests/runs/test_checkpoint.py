@@ -30,7 +30,7 @@ class Pair(NamedTuple):
 
 @flax.struct.dataclass
 class Run:
-    """A stand-in for TrainState with every kind of container and leaf that it holds."""
+    """A stand-in for TrainState with each kind of container and leaf that TrainState holds."""
 
     params: Any
     opt_state: Any
@@ -40,7 +40,7 @@ class Run:
     step: jax.Array
 
 
-def make(key: jax.Array, step: int = 0) -> Run:
+def make_run(key: jax.Array, step: int = 0) -> Run:
     _, params, _ = nnx.split(nnx.Linear(3, 2, rngs=nnx.Rngs(0)), nnx.Param, ...)
     params = jax.tree.map(lambda x: jax.random.normal(key, x.shape, x.dtype), params)
     return Run(
@@ -64,7 +64,7 @@ def assert_same(a: Any, b: Any) -> None:
 
 @pytest.fixture
 def template() -> Any:
-    return jax.eval_shape(make, jax.random.key(0))
+    return jax.eval_shape(make_run, jax.random.key(0))
 
 
 def largest_file(folder: Path) -> Path:
@@ -73,7 +73,7 @@ def largest_file(folder: Path) -> Path:
 
 def test_restores_every_leaf_bit_for_bit_and_keeps_two(tmp_path: Path, template: Any) -> None:
     for step in (0, 4, 8):
-        state = make(jax.random.key(step), step)
+        state = make_run(jax.random.key(step), step)
         checkpoint.save(tmp_path, state, CONFIG)
     assert_same(checkpoint.restore(tmp_path, template, CONFIG), state)
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["4", "8"]
@@ -82,7 +82,7 @@ def test_restores_every_leaf_bit_for_bit_and_keeps_two(tmp_path: Path, template:
 
 @pytest.mark.parametrize("impl", ["rbg", "unsafe_rbg"])
 def test_restored_keys_keep_their_implementation(tmp_path: Path, impl: str) -> None:
-    state = make(jax.random.key(1, impl=impl), 1)
+    state = make_run(jax.random.key(1, impl=impl), 1)
     checkpoint.save(tmp_path, state, CONFIG)
     restored = checkpoint.restore(tmp_path, jax.eval_shape(lambda: state), CONFIG)
     assert jax.random.key_impl(restored.keys) == impl
@@ -95,50 +95,78 @@ def test_missing_checkpoint_is_named(tmp_path: Path, template: Any) -> None:
 
 
 def test_first_differing_field_of_another_config_is_named(tmp_path: Path, template: Any) -> None:
-    checkpoint.save(tmp_path, make(jax.random.key(0)), CONFIG)
+    checkpoint.save(tmp_path, make_run(jax.random.key(0)), CONFIG)
     other = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, channels=(8, 32)))
-    with pytest.raises(CheckpointError, match=r"encoder\.channels is \[8, 16\] there and \[8, 32\] here"):
+    with pytest.raises(CheckpointError, match=r"encoder\.channels is \[8, 16\] in the checkpoint and \[8, 32\] now"):
         checkpoint.restore(tmp_path, template, other)
 
 
-def test_what_only_evaluation_reads_may_differ(tmp_path: Path, template: Any) -> None:
-    state = make(jax.random.key(0))
+def test_fields_that_only_the_evaluation_reads_may_differ(tmp_path: Path, template: Any) -> None:
+    state = make_run(jax.random.key(0))
     checkpoint.save(tmp_path, state, CONFIG)
     other = dataclasses.replace(CONFIG, evaluation=dataclasses.replace(CONFIG.evaluation, num_runs=7))
     assert_same(checkpoint.restore(tmp_path, template, other), state)
 
 
 def test_state_of_another_shape_is_named(tmp_path: Path) -> None:
-    checkpoint.save(tmp_path, make(jax.random.key(0)), CONFIG)
-    with pytest.raises(CheckpointError, match="does not fit this version"):
+    checkpoint.save(tmp_path, make_run(jax.random.key(0)), CONFIG)
+    with pytest.raises(CheckpointError, match=r"step is int32\[\] in the checkpoint and float32\[\] now"):
         checkpoint.restore(tmp_path, {"step": jnp.zeros(())}, CONFIG)
 
 
-def test_every_file_cut_short_is_an_error_in_one_line(tmp_path: Path, template: Any) -> None:
-    state = make(jax.random.key(0), 3)
+def test_the_version_of_a_checkpoint_that_does_not_fit_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, template: Any
+) -> None:
+    with monkeypatch.context() as context:
+        context.setattr(checkpoint, "_own_version", lambda: "9.8.7")
+        checkpoint.save(tmp_path, make_run(jax.random.key(0)), CONFIG)
+    with pytest.raises(
+        CheckpointError, match=r"written by vsearch_jax 9\.8\.7, does not fit .* use vsearch_jax 9\.8\.7"
+    ):
+        checkpoint.restore(tmp_path, {"step": jnp.zeros(())}, CONFIG)
+    other = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, channels=(8, 32)))
+    with pytest.raises(CheckpointError, match=r"written by vsearch_jax 9\.8\.7, belongs to another config"):
+        checkpoint.restore(tmp_path, template, other)
+
+
+def test_every_file_cut_in_half_is_an_error_of_one_line(tmp_path: Path, template: Any) -> None:
+    state = make_run(jax.random.key(0), 3)
     checkpoint.save(tmp_path, state, CONFIG)
     folder = tmp_path / "checkpoints" / "3"
-    damaging = 0
+    num_damaging = 0
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.stat().st_size > 1):
         whole = path.read_bytes()
         path.write_bytes(whole[: len(whole) // 2])
         try:
-            # A file that nothing reads may be cut, if all that is read is right.
+            # Some files are not read. If one of them is cut, the restored state must be right.
             assert_same(checkpoint.restore(tmp_path, template, CONFIG), state)
         except CheckpointError as error:
-            damaging += 1
+            num_damaging += 1
             assert "\n" not in str(error) and str(folder) in str(error) and "damaged" in str(error)
+            assert "there is no other checkpoint" in str(error) and "delete" not in str(error)
         path.write_bytes(whole)
-    assert damaging >= 3
+    assert num_damaging >= 3
     assert_same(checkpoint.restore(tmp_path, template, CONFIG), state)
 
 
-def test_leftovers_of_a_killed_save_are_no_checkpoint(tmp_path: Path, template: Any) -> None:
-    """SIGKILL at many moments of a loop that saves: what is left is always whole and can be gone on from."""
+def test_a_damaged_checkpoint_is_moved_aside_and_the_earlier_one_is_read(tmp_path: Path, template: Any) -> None:
+    states = [make_run(jax.random.key(step), step) for step in (2, 4)]
+    for state in states:
+        checkpoint.save(tmp_path, state, CONFIG)
+    damaged = tmp_path / "checkpoints" / "4"
+    path = largest_file(damaged / "state")
+    path.write_bytes(path.read_bytes()[:10])
+    with pytest.raises(CheckpointError, match=r"move that folder out of .* resume from iteration 2: vsearch train"):
+        checkpoint.restore(tmp_path, template, CONFIG)
+    damaged.rename(tmp_path / "damaged-4")
+    assert_same(checkpoint.restore(tmp_path, template, CONFIG), states[0])
+
+
+def test_a_save_killed_at_any_moment_leaves_a_whole_checkpoint(tmp_path: Path, template: Any) -> None:
     code = (
         "import sys, jax; from pathlib import Path; sys.path.insert(0, sys.argv[2]);"
-        "from test_checkpoint import make, CONFIG; from vsearch_jax import checkpoint\n"
-        "for step in range(10**6): checkpoint.save(Path(sys.argv[1]), make(jax.random.key(step), step), CONFIG)"
+        "from test_checkpoint import make_run, CONFIG; from vsearch_jax.runs import checkpoint\n"
+        "for step in range(10**6): checkpoint.save(Path(sys.argv[1]), make_run(jax.random.key(step), step), CONFIG)"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), str(Path(__file__).parent)], env=environment)
@@ -149,6 +177,6 @@ def test_leftovers_of_a_killed_save_are_no_checkpoint(tmp_path: Path, template: 
     process.wait()
     step = checkpoint.latest_step(tmp_path)
     assert step is not None and step >= 3
-    assert_same(checkpoint.restore(tmp_path, template, CONFIG), make(jax.random.key(step), step))
-    checkpoint.save(tmp_path, make(jax.random.key(step), step + 1), CONFIG)
+    assert_same(checkpoint.restore(tmp_path, template, CONFIG), make_run(jax.random.key(step), step))
+    checkpoint.save(tmp_path, make_run(jax.random.key(step), step + 1), CONFIG)
     assert checkpoint.latest_step(tmp_path) == step + 1

@@ -1,6 +1,7 @@
-"""A run without scene and networks in place of the real one: what is tested is the loop around it.
+"""A fast stand-in for init, train, evaluate and record_search, without a scene and networks.
 
-As a program it is the `vsearch` command over that run: `python fast_run.py train --preset smoke --out DIR`.
+Tests of the loop of a run and of the command line use it. As a program it is the command `vsearch` with this stand-in:
+`PYTHONPATH=tests python -m samples.fast_run train --preset smoke --out DIR`.
 """
 
 import functools
@@ -18,11 +19,14 @@ from vsearch_jax.runs import loop
 from vsearch_jax.training import POLICY_METRICS
 from vsearch_jax.types import ReachabilityMap
 
-CHUNK_SECONDS = 3.0  # a test has so long to interrupt a chunk, on a machine that stalls too
+CHUNK_SECONDS = 3.0
+"""Duration of a chunk. A test needs this time to interrupt a chunk, also on a slow machine."""
 
 
 @flax.struct.dataclass
 class State:
+    """A stand-in for TrainState."""
+
     weights: jax.Array
     reach: ReachabilityMap
     key: jax.Array
@@ -31,6 +35,7 @@ class State:
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: jax.Array, config: Config) -> State:
+    """Returns random weights and a made-up reachability map."""
     return State(jax.random.normal(key, (1000,)), made_up.reach(), key, jnp.zeros((), jnp.int32))
 
 
@@ -50,20 +55,23 @@ def _train(state: State, config: Config) -> tuple[State, dict[str, jax.Array]]:
 
 
 def train(state: State, config: Config) -> tuple[State, dict[str, jax.Array]]:
+    """Does one chunk in `CHUNK_SECONDS`."""
     time.sleep(CHUNK_SECONDS)
     return _train(state, config)
 
 
 def evaluate(state: State, config: Config) -> dict[str, Any]:
+    """Returns made-up results."""
     return made_up.evaluation(config.sac.num_seeds)
 
 
 def record_search(state: State, config: Config) -> dict[str, Any]:
+    """Returns a made-up search."""
     return made_up.search()
 
 
 def install() -> None:
-    """Puts the stand-in in the place of the real run."""
+    """Replaces the functions of the real run."""
     loop.init, loop.train, loop.evaluate, loop.record_search = init, train, evaluate, record_search
 
 

@@ -1,1 +1,1 @@
-"""The `vsearch` command."""
+"""The command `vsearch`."""

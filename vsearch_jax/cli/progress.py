@@ -1,57 +1,70 @@
-"""What a person sees of a run while it trains: a bar on a terminal, a line a chunk in a file."""
+"""Progress of the training: a bar on a terminal, one line for each chunk in a file."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vsearch_jax.config import Config
+from vsearch_jax.runs.metrics_log import MetricsLine
 
-_LOSSES = {"encoder": "encoder_loss", "policy": "critic_loss"}
+_LOSS_OF_STAGE = {"encoder": "encoder_loss", "policy": "critic_loss"}
 
 
 class TrainingProgress:
-    """What the loop of chunks reports to.
+    """Shows the progress of a run. Its methods are the callbacks of `runs.train_to_end`.
 
     Attributes:
       bar: the bar on the terminal.
-      console: where the lines of the chunks go where there is no terminal.
+      console: receives the lines of the chunks if there is no terminal.
       config: the run's config.
     """
 
     def __init__(self, bar: Progress, console: Console, config: Config, step: int) -> None:
-        """Starts the bar at iteration `step`."""
+        """Starts the bar.
+
+        Args:
+          bar: the bar on the terminal.
+          console: receives the lines of the chunks if there is no terminal.
+          config: the run's config.
+          step: number of iterations already done.
+        """
         self.bar, self.console, self.config = bar, console, config
         self._task = bar.add_task("compiling", total=config.num_iterations, completed=step)
 
-    def update(self, step: int, seconds: float, lines: Sequence[Mapping[str, Any]]) -> None:
-        """Shows a chunk: `step` iterations done, its wall time in s, its lines of metrics.jsonl."""
-        text = describe(seconds, lines)
+    def update(self, step: int, seconds: float, lines: Sequence[MetricsLine]) -> None:
+        """Shows that a chunk of iterations is done: moves the bar, or prints a line without a terminal.
+
+        Args:
+          step: number of iterations of the run that are done.
+          seconds: wall time of the chunk in s.
+          lines: metrics of the chunk, one entry for each iteration.
+        """
+        text = summarize_chunk(seconds, lines)
         self.bar.update(self._task, completed=step, description=text)
         if not self.console.is_terminal:
             self.console.print(f"{step}/{self.config.num_iterations} {text}", highlight=False)
 
-    def stopping(self) -> None:
-        """Says that the running chunk is the last."""
+    def announce_stop(self) -> None:
+        """Shows that the training stops after the chunk of iterations that is running."""
         self.bar.update(self._task, description="stopping after this chunk")
-        self.console.print("stopping after this chunk; interrupt again to leave it unsaved", highlight=False)
+        self.console.print("stopping after this chunk; interrupt again to stop now, without saving it", highlight=False)
 
 
 @contextlib.contextmanager
 def training_progress(console: Console, config: Config, step: int) -> Iterator[TrainingProgress]:
-    """Shows the progress of training inside its block.
+    """Shows the progress of a training while the `with` block runs: a bar on a terminal, else lines.
 
     Args:
-      console: where to.
+      console: the rich console to print on.
       config: the run's config.
-      step: iterations done before.
+      step: number of iterations already done.
 
     Yields:
-      What to report to.
+      The display. The block tells it of each chunk that is done.
     """
     bar = Progress(
         SpinnerColumn(),
@@ -68,11 +81,19 @@ def training_progress(console: Console, config: Config, step: int) -> Iterator[T
         yield TrainingProgress(bar, console, config, step)
 
 
-def describe(seconds: float, lines: Sequence[Mapping[str, Any]]) -> str:
-    """Returns stage, rate, loss and, once there are any, reward and success of a chunk, means over its iterations."""
+def summarize_chunk(seconds: float, lines: Sequence[MetricsLine]) -> str:
+    """Describes a chunk of iterations in one line: stage, iterations a second, means of loss, reward and success.
+
+    Args:
+      seconds: wall time of the chunk in s.
+      lines: metrics of the chunk, one entry for each iteration. A metric that no entry has is left out.
+
+    Returns:
+      The line of text.
+    """
     stage = lines[-1]["stage"]
     parts = [stage, f"{len(lines) / seconds:.1f} iterations/s"]
-    for name, key in {"loss": _LOSSES[stage], "reward": "reward", "success": "success_rate"}.items():
+    for name, key in {"loss": _LOSS_OF_STAGE[stage], "reward": "reward", "success": "success_rate"}.items():
         values = [line[key] for line in lines if key in line]
         if values:
             parts.append(f"{name} {sum(values) / len(values):.4g}")

@@ -1,1 +1,1 @@
-"""A trained encoder and policy as files that run without this package."""
+"""Files of a trained encoder and policy that run without this package."""

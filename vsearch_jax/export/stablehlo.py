@@ -1,17 +1,19 @@
-"""A trained encoder and policy as StableHLO files, which `jax.export` reads back without this package."""
+"""Writes a trained encoder and policy as StableHLO files. `jax.export` reads them without this package."""
 
 from __future__ import annotations
 
 import functools
 import json
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.export
 import jax.numpy as jnp
+from flax import nnx
 from jax import Array
+from jax.core import ShapedArray
 
 from vsearch_jax import encoder as encoders
 from vsearch_jax.config import Config, ConfigError
@@ -20,66 +22,84 @@ from vsearch_jax.search import sac
 from vsearch_jax.types import EncoderState, Image, TrainState
 
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""Where the files run."""
+"""Platforms on which the files run."""
+
+_INPUT_MEANINGS = {
+    "rgb": "uint8; row 0 is the top, the object is in the middle",
+    "depth": "metres along the optical axis; inf where nothing was measured",
+    "silhouette": "0 off the object, above 0 on it",
+}
 
 
 def encode_picture(picture: Array, *, encoder: EncoderState, config: Config) -> Array:
-    """Returns the code f32[Z] of one picture as a camera gives it.
+    """Computes the code of one camera image: the normalised encoder output that the policy reads.
 
     Args:
-      picture: by `config.encoder.input`: rgb u8[H, W, 3]; depth f32[H, W] m along the optical axis, +inf where there is
-        none; silhouette u8[H, W], 0 off the object.
+      picture: the image as a camera gives it. The type depends on `config.encoder.input`:
+        rgb: u8[H, W, 3]; row 0 is the top.
+        depth: f32[H, W] m along the optical axis; +inf where nothing was measured.
+        silhouette: u8[H, W]; 0 off the object, above 0 on it.
       encoder: a trained EncoderState.
-      config: the run's.
+      config: the run's config.
+
+    Returns:
+      Code of Z numbers, f32[Z].
     """
-    blank = Image(rgb=jnp.zeros(()), depth=jnp.zeros(()), geom_id=jnp.zeros(()))
-    images = {
-        "rgb": lambda: blank.replace(rgb=picture.astype(jnp.float32) / 255.0),  # pyright: ignore[reportAttributeAccessIssue]
-        "depth": lambda: blank.replace(depth=picture),  # pyright: ignore[reportAttributeAccessIssue] # flax adds it
-        "silhouette": lambda: blank.replace(geom_id=(picture > 0).astype(jnp.int32)),  # pyright: ignore[reportAttributeAccessIssue]
-    }
-    x = encoders.network_input(images[config.encoder.input](), jnp.ones(1, jnp.int32), config)
+    rgb, depth, geom_id = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
+    if config.encoder.input == "rgb":
+        rgb = picture.astype(jnp.float32) / 255.0
+    elif config.encoder.input == "depth":
+        depth = picture
+    else:
+        geom_id = (picture > 0).astype(jnp.int32)
+    image = Image(rgb=rgb, depth=depth, geom_id=geom_id)
+    x = encoders.network_input(image, jnp.ones(1, jnp.int32), config)
     return encoders.encode(encoder, x, config)
 
 
 def policy_step(
-    picture: Array, target_code: Array, qpos: Array, *, encoder: EncoderState, actor: Any, config: Config
+    picture: Array, target_code: Array, qpos: Array, *, encoder: EncoderState, actor: nnx.State, config: Config
 ) -> tuple[Array, Array]:
-    """Returns where the policy would move next, f32[2] in [-1, 1], and the picture's cosine f32[] with the target.
+    """Computes the policy's next camera move (the action) from one camera image.
 
     Args:
-      picture: see `encode_picture`.
-      target_code: f32[Z], code of the target picture.
-      qpos: f32[nq] rad or m, present joints.
+      picture: the image as a camera gives it, as for `encode_picture`.
+      target_code: f32[Z], code of the target image, from `encode_picture`.
+      qpos: f32[nq] rad or m, present joint values.
       encoder: a trained EncoderState.
       actor: parameters of one policy.
-      config: the run's.
+      config: the run's config.
+
+    Returns:
+      The action f32[2] in [-1, 1]: change of azimuth and elevation in units of `env.action_scale_deg`. And the cosine
+      f32[] between the image's code and the target's code.
     """
     code = encode_picture(picture, encoder=encoder, config=config)
     action = sac.act(None, actor, jnp.concatenate([code, target_code, qpos]), config.sac)
     return action, cosine_similarity(code, target_code)
 
 
-def export(folder: Path, state: TrainState, config: Config, seed: int = 0) -> None:
-    """Writes encoder.stablehlo, policy.stablehlo and interface.json, which describes both, into `folder`.
+def export(folder: Path, state: TrainState, config: Config, policy: int = 0) -> None:
+    """Exports encoder and one policy as StableHLO files, which run without this package.
 
-    Both take batches of any size. To call one:
+    Writes `encoder.stablehlo`, `policy.stablehlo` and `interface.json`, which describes both. Both functions take
+    batches of any size. To call one:
     `jax.export.deserialize(bytearray(path.read_bytes())).call(...)`.
 
     Args:
-      folder: where to; made if it is not there.
-      state: of a finished run.
+      folder: folder of the files. It is made if it does not exist.
+      state: state of a finished run.
       config: the run's config.
-      seed: which of the run's policies.
+      policy: number of the policy to export, from 0.
 
     Raises:
-      ConfigError: the run has no policy of that number.
+      ConfigError: the run has no policy of this number.
       OSError: the disk is full or not writable.
     """
-    num_seeds = config.sac.num_seeds
-    if not 0 <= seed < num_seeds:
-        raise ConfigError(f"policy {seed} does not exist; allowed: 0 to {num_seeds - 1}")
-    actor = jax.tree.map(lambda x: x[seed], state.sac.actor)
+    num_policies = config.sac.num_seeds
+    if not 0 <= policy < num_policies:
+        raise ConfigError(f"policy {policy} does not exist; allowed: 0 to {num_policies - 1}")
+    actor = jax.tree.map(lambda x: x[policy], state.sac.actor)
     encode = functools.partial(encode_picture, encoder=state.encoder, config=config)
     act = functools.partial(policy_step, encoder=state.encoder, actor=actor, config=config)
     arguments = _arguments(config, state.pool.qpos.shape[-1])
@@ -90,12 +110,12 @@ def export(folder: Path, state: TrainState, config: Config, seed: int = 0) -> No
     folder.mkdir(parents=True, exist_ok=True)
     for name, function in exported.items():
         (folder / f"{name}.stablehlo").write_bytes(function.serialize())
-    (folder / "interface.json").write_text(
-        json.dumps(_interface(exported, state, config), indent=2) + "\n", encoding="utf-8"
-    )
+    interface = json.dumps(_interface(exported, state, config), indent=2) + "\n"
+    (folder / "interface.json").write_text(interface, encoding="utf-8")
 
 
 def _arguments(config: Config, num_joints: int) -> tuple[jax.ShapeDtypeStruct, ...]:
+    """Returns shapes and dtypes of picture, target code and joint values, with a symbolic batch axis."""
     (batch,) = jax.export.symbolic_shape("batch")
     size = config.scene.image_size
     picture = {
@@ -110,12 +130,13 @@ def _arguments(config: Config, num_joints: int) -> tuple[jax.ShapeDtypeStruct, .
     )
 
 
-def _export(function: Any, arguments: tuple[jax.ShapeDtypeStruct, ...]) -> jax.export.Exported:
+def _export(function: Callable[..., object], arguments: tuple[jax.ShapeDtypeStruct, ...]) -> jax.export.Exported:
     return jax.export.export(jax.jit(jax.vmap(function)), platforms=PLATFORMS)(*arguments)
 
 
-def _interface(exported: dict[str, jax.export.Exported], state: TrainState, config: Config) -> dict[str, Any]:
-    meanings = {
+def _interface(exported: dict[str, jax.export.Exported], state: TrainState, config: Config) -> dict[str, object]:
+    """Returns the content of `interface.json`."""
+    names = {
         "encoder": (["picture"], ["code"]),
         "policy": (["picture", "target_code", "qpos"], ["action", "similarity"]),
     }
@@ -123,25 +144,21 @@ def _interface(exported: dict[str, jax.export.Exported], state: TrainState, conf
         name: {
             "file": f"{name}.stablehlo",
             "platforms": list(function.platforms),
-            "inputs": _describe(meanings[name][0], function.in_avals),
-            "outputs": _describe(meanings[name][1], function.out_avals),
+            "inputs": _describe(names[name][0], function.in_avals),
+            "outputs": _describe(names[name][1], function.out_avals),
         }
         for name, function in exported.items()
     }
     return {
         "functions": functions,
-        "policy": "the mean of the trained policy; it keeps no memory of the episode",
+        "policy": "the mean action of the trained policy; the policy has no memory",
         "meaning": {
-            "picture": {
-                "rgb": "uint8, row 0 is the top, the object in the middle",
-                "depth": "metres along the optical axis, inf where nothing was measured",
-                "silhouette": "0 off the object",
-            }[config.encoder.input],
-            "code": "of a picture; that of the target picture is the policy's target_code",
-            "qpos": "present joints of the arm and its gripper, rad and m, in MuJoCo's order",
-            "action": f"change of azimuth and elevation, from -1 to 1, in {config.env.action_scale_deg:g} degrees; a "
-            "view off the band's elevations is out of reach",
-            "similarity": f"cosine of the two codes; the view is found from {config.env.threshold:g} on",
+            "picture": _INPUT_MEANINGS[config.encoder.input],
+            "code": "code of the picture; the policy's target_code is the code of the target picture",
+            "qpos": "present joint values of the arm and its gripper, rad or m, in MuJoCo's order",
+            "action": f"change of azimuth and elevation, from -1 to 1, in units of {config.env.action_scale_deg:g} "
+            "degrees; the arm cannot reach views outside the band",
+            "similarity": f"cosine of the two codes; the view is found at {config.env.threshold:g} or more",
         },
         "fovy_deg": math.degrees(float(state.pool.camera.fovy[0])),
         "band_deg": [math.degrees(float(end)) for end in state.reach.band],
@@ -150,8 +167,9 @@ def _interface(exported: dict[str, jax.export.Exported], state: TrainState, conf
     }
 
 
-def _describe(names: list[str], avals: Any) -> list[dict[str, Any]]:
+def _describe(names: Sequence[str], avals: Sequence[ShapedArray]) -> list[dict[str, object]]:
+    """Returns name, shape and dtype of each argument or result. A symbolic axis is its name."""
     return [
-        {"name": name, "shape": [str(n) if not isinstance(n, int) else n for n in aval.shape], "dtype": str(aval.dtype)}
+        {"name": name, "shape": [n if isinstance(n, int) else str(n) for n in aval.shape], "dtype": str(aval.dtype)}
         for name, aval in zip(names, avals, strict=True)
     ]

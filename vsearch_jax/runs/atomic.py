@@ -1,4 +1,4 @@
-"""Files that are replaced whole or not at all."""
+"""Atomic replacement of files."""
 
 from __future__ import annotations
 
@@ -9,19 +9,34 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Replaces the file `path` in one step: whoever reads it sees the old content or the new one."""
+    """Writes a file in one step. A reader sees the old content or the whole new content, never a part of it.
+
+    Args:
+      path: the file. An old file of this name is replaced.
+      content: text, which is written as UTF-8, or bytes.
+
+    Raises:
+      OSError: the disk is full or not writable. The old file stays.
+    """
     with replace_file(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
-    """Yields an empty file beside `path`, of the same suffix, that takes its name when the block ends well."""
+    """Replaces the file `path` in one step at the end of a `with` block, which writes the new content.
+
+    If the block raises an exception, the old file stays.
+
+    Yields:
+      An empty temporary file in the same folder, with the same suffix. The block writes into it.
+    """
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
         with temporary.open("wb") as file:
             yield temporary
-            os.fsync(file.fileno())  # else a crash of the machine may leave the new name with no content
+            # Without fsync, a crash of the machine can leave the new name with no content.
+            os.fsync(file.fileno())
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -1,18 +1,20 @@
-"""Checkpoints of a whole run by orbax: written to a temporary folder and renamed, so a killed save leaves the last one.
+"""Checkpoints of a run, written by orbax.
 
-Leaves are stored flat under the path of their pytree, so what is on disk does not depend on how orbax sees nnx, optax
-or brax containers; typed PRNG keys are stored as their data beside the name of their implementation.
+Orbax writes to a temporary folder and then renames it. So a killed save leaves the last checkpoint intact.
+Arrays are stored flat, each under its path in the pytree. So the files do not depend on how orbax treats the containers
+of nnx, optax and brax. A typed PRNG key is stored as its data. The name of its implementation is stored apart.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import json
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, Protocol, TypeAlias, TypedDict, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -22,50 +24,80 @@ import tensorstore
 
 from vsearch_jax.config import Config
 from vsearch_jax.runs.folder import CHECKPOINTS
+from vsearch_jax.runs.old_versions import UNVERSIONED, current_names
 
 NUM_KEPT = 2
-"""Checkpoints kept in a run's folder: the last one and the one before."""
+"""Number of checkpoints kept in a run's folder: the last one and the one before."""
 
 _ABSENT = "absent"
-_UNTRAINED = ("random_search", "cma_es", "evaluation", "num_chunks")
-"""Parts of the config that a trained state does not depend on."""
+_UNTRAINED_SECTIONS = ("random_search", "cma_es", "evaluation", "num_chunks")
+"""Parts of the config that do not change the trained state."""
+
+
+class _HasStep(Protocol):
+    """A pytree with the number of iterations done, i32[]."""
+
+    @property
+    def step(self) -> jax.Array: ...
+
+
+State = TypeVar("State")
+Described: TypeAlias = tuple[list[int], str]
+"""Shape and dtype of an array. JSON stores the tuple as a list."""
+
+
+class _About(TypedDict):
+    """Description of a checkpoint, stored as JSON beside the arrays.
+
+    Attributes:
+      version: version of vsearch_jax that wrote the checkpoint; missing in checkpoints of version 0.1.0.
+      config: `Config.to_dict` of the run.
+      keys: for each typed PRNG key the name of its implementation.
+      arrays: for each array its shape and dtype.
+    """
+
+    version: NotRequired[str]
+    config: dict[str, object]
+    keys: dict[str, str]
+    arrays: dict[str, Described]
 
 
 class CheckpointError(ValueError):
-    """A checkpoint is missing, damaged or of another config; the message says which and what to do."""
+    """A checkpoint is missing, damaged, or belongs to another config or version. The message names the remedy."""
 
 
-def save(run: Path, state: Any, config: Config) -> None:
-    """Saves `state` as the checkpoint of its step; returns when it is on disk.
+def save(run: Path, state: _HasStep, config: Config) -> None:
+    """Saves the state of a run as a checkpoint, and returns when the checkpoint is on disk.
 
     Args:
-      run: the run's folder; the checkpoint goes to `run/checkpoints/<step>`.
-      state: a pytree of arrays with an attribute `step`, i32[].
-      config: the run's config, kept beside the arrays.
+      run: folder of the run. The checkpoint goes to `run/checkpoints/<step>`.
+      state: pytree of arrays. The attribute `step`, i32[], is the number of iterations done.
+      config: the run's config, stored beside the arrays.
 
     Raises:
-      CheckpointError: the folder holds a checkpoint of this step or a later one.
+      CheckpointError: the folder holds a checkpoint of this step or of a later one.
       OSError: the disk is full or not writable.
     """
     leaves = _named_leaves(state)
     stored = {name: np.asarray(_data(leaf)) for name, leaf in leaves.items()}
-    about = {
+    about: _About = {
+        "version": _own_version(),
         "config": config.to_dict(),
         "keys": {name: str(jax.random.key_impl(leaf)) for name, leaf in leaves.items() if _is_key(leaf)},
-        "arrays": {name: _describe(array) for name, array in stored.items()},
+        "arrays": {name: _shape_and_dtype(array) for name, array in stored.items()},
     }
-    arguments = ocp.args.Composite(state=ocp.args.StandardSave(_not_empty(stored)), about=ocp.args.JsonSave(about))
-    with _one_error(), _manager(run) as manager:
+    arguments = ocp.args.Composite(state=ocp.args.StandardSave(_nonempty(stored)), about=ocp.args.JsonSave(about))
+    with _quiet_errors(), _manager(run) as manager:
         try:
             is_saved = manager.save(int(state.step), args=arguments)
-        except ValueError as error:  # tensorstore reports what the disk refused as a ValueError
+        except ValueError as error:  # tensorstore reports a full disk as a ValueError
             raise OSError(f"cannot write a checkpoint to {run / CHECKPOINTS}: {_first_line(error)}") from error
-    if not is_saved:  # orbax leaves a step alone that is not past the last one
+    if not is_saved:  # Orbax does not save a step that is not after the last one.
         raise CheckpointError(f"{run / CHECKPOINTS} holds step {latest_step(run)} already; train into another folder")
 
 
 def latest_step(run: Path) -> int | None:
-    """Returns the step of the last complete checkpoint in the folder `run`, None if there is none."""
+    """Returns the step (iterations done) of the last complete checkpoint in a run's folder, None if there is none."""
     return max(_steps(run), default=None)
 
 
@@ -73,141 +105,178 @@ def _steps(run: Path) -> list[int]:
     return [int(path.name) for path in (run / CHECKPOINTS).glob("*") if path.name.isdecimal()]
 
 
-def restore(run: Path, template: Any, config: Config) -> Any:
-    """Returns the last checkpoint in the folder `run`.
+def restore(run: Path, template: State, config: Config) -> State:
+    """Loads the state that the last checkpoint of a run holds.
 
     Args:
-      run: the run's folder.
-      template: a pytree of arrays or `jax.ShapeDtypeStruct` like the one saved, as `jax.eval_shape` of `init` gives.
-      config: the config that the run is to go on with; what only evaluation reads may differ.
+      run: folder of the run.
+      template: pytree of arrays or `jax.ShapeDtypeStruct` with the structure of the saved state, for example
+        `jax.eval_shape` of `init`.
+      config: config with which the run continues. Fields that only the evaluation reads may differ.
+
+    Returns:
+      The saved state. Checkpoints of version 0.1.0 are converted.
 
     Raises:
-      CheckpointError: there is no checkpoint, it is damaged, or it belongs to another config.
+      CheckpointError: the checkpoint is missing, damaged, or belongs to another config or version.
     """
     step = latest_step(run)
     if step is None:
-        raise CheckpointError(f"no checkpoint in {run / CHECKPOINTS}; train anew, into another folder")
+        raise CheckpointError(f"no checkpoint in {run / CHECKPOINTS}; start a new run in another folder")
     folder = run / CHECKPOINTS / str(step)
-    about = _read(run, step, "about", ocp.args.JsonRestore())
-    _check_config(folder, about["config"], config)
-    expected = {name: jax.eval_shape(_data, leaf) for name, leaf in _named_leaves(template).items()}
-    _check_arrays(folder, about["arrays"], {name: _describe(leaf) for name, leaf in expected.items()})
-    # Restored to numpy first: orbax would place jax arrays on the devices of the machine that saved them.
-    arrays = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in expected.items()}
-    arrays |= _read(run, step, "state", ocp.args.StandardRestore(_not_empty(arrays)))
-    leaves = [_leaf(arrays[name], about["keys"].get(name)) for name in expected]
-    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+    about = cast(_About, _read(run, step, "about", ocp.args.JsonRestore()))  # JSON has no static type
+    version = about.get("version", UNVERSIONED)
+    _check_config(folder, about["config"], config, version)
+    described = {name: (shape, dtype) for name, (shape, dtype) in about["arrays"].items()}
+    names = current_names(described, version)
+    leaves = {name: jax.eval_shape(_data, leaf) for name, leaf in _named_leaves(template).items()}
+    expected = {name: _shape_and_dtype(leaf) for name, leaf in leaves.items()}
+    _check_arrays(folder, {names[stored]: described[stored] for stored in names}, expected, version)
+    arrays = _read_arrays(run, step, described)
+    current = {names[stored]: array for stored, array in arrays.items() if stored in names}
+    keys = {names[stored]: implementation for stored, implementation in about["keys"].items()}
+    restored = [_to_leaf(current[name], keys.get(name)) for name in expected]
+    return jax.tree.unflatten(jax.tree.structure(template), restored)
 
 
-def first_difference(saved: dict[str, Any], config: Config) -> str | None:
-    """Returns "field is X there and Y here" for the first trained field in which `saved` differs, None if all agree.
-
-    Args:
-      saved: `Config.to_dict` of the other config, as it was or as read from JSON.
-      config: the config at hand.
-    """
-    here, there = _flatten(_as_json(config.to_dict())), _flatten(_as_json(saved))
-    for name in [*here, *there]:
-        is_trained = name.split(".")[0] not in _UNTRAINED
-        if is_trained and here.get(name, _ABSENT) != there.get(name, _ABSENT):
-            return f"{name} is {there.get(name, _ABSENT)} there and {here.get(name, _ABSENT)} here"
+def _first_difference(saved: Mapping[str, object], config: Config) -> str | None:
+    """Returns the first field that differs and that changes the trained state, as text; None if all fields agree."""
+    now, before = _flatten(_as_json(config.to_dict())), _flatten(saved)
+    for name in [*now, *before]:
+        is_trained = name.split(".")[0] not in _UNTRAINED_SECTIONS
+        if is_trained and now.get(name, _ABSENT) != before.get(name, _ABSENT):
+            return f"{name} is {before.get(name, _ABSENT)} in the checkpoint and {now.get(name, _ABSENT)} now"
     return None
 
 
-def _check_config(folder: Path, saved: dict[str, Any], config: Config) -> None:
-    difference = first_difference(saved, config)
+def _check_config(folder: Path, saved: Mapping[str, object], config: Config, version: str) -> None:
+    difference = _first_difference(saved, config)
     if difference is not None:
         raise CheckpointError(
-            f"checkpoint {folder} is of another config: {difference}; use its config or another folder"
+            f"checkpoint {folder}, written by vsearch_jax {version}, belongs to another config: {difference}; use the "
+            "config of the checkpoint, or another folder"
         )
 
 
-def _check_arrays(folder: Path, saved: dict[str, list[Any]], expected: dict[str, list[Any]]) -> None:
-    for name in [*expected, *saved]:
-        if saved.get(name) != expected.get(name):
+def _check_arrays(
+    folder: Path, found: Mapping[str, Described], expected: Mapping[str, Described], version: str
+) -> None:
+    for name in [*expected, *found]:
+        if found.get(name) != expected.get(name):
             raise CheckpointError(
-                f"checkpoint {folder} does not fit this version of vsearch_jax: {name} is {saved.get(name)} there "
-                f"and {expected.get(name)} here; use the version that wrote it"
+                f"checkpoint {folder}, written by vsearch_jax {version}, does not fit vsearch_jax {_own_version()}: "
+                f"{name} is {_text(found.get(name))} in the checkpoint and {_text(expected.get(name))} now; use "
+                f"vsearch_jax {version} to read it"
             )
 
 
+def _text(described: Described | None) -> str:
+    return _ABSENT if described is None else f"{described[1]}{described[0]}"
+
+
+def _own_version() -> str:
+    return importlib.metadata.version("vsearch_jax")
+
+
 def _manager(run: Path) -> ocp.CheckpointManager:
-    # Not asynchronous: the next chunk donates the arrays, and a save takes well under a second.
+    # Not asynchronous: the next chunk donates the arrays, and a save takes less than a second.
     options = ocp.CheckpointManagerOptions(max_to_keep=NUM_KEPT, enable_async_checkpointing=False)
     return ocp.CheckpointManager((run / CHECKPOINTS).absolute(), options=options)
 
 
-def _read(run: Path, step: int, item: str, arguments: ocp.args.CheckpointArgs) -> Any:
+def _read_arrays(run: Path, step: int, described: Mapping[str, Described]) -> dict[str, np.ndarray]:
+    """Reads all arrays of a checkpoint.
+
+    Args:
+      run: folder of the run.
+      step: step of the checkpoint.
+      described: shape and dtype of each stored array.
+    """
+    # Orbax needs templates. They are numpy arrays, because it would place JAX arrays on the devices that saved them.
+    empty = {name: np.empty(shape, jnp.dtype(dtype)) for name, (shape, dtype) in described.items()}
+    read = _read(run, step, "state", ocp.args.StandardRestore(_nonempty(empty)))
+    return empty | cast(dict[str, np.ndarray], read)  # orbax returns the structure of the templates
+
+
+def _read(run: Path, step: int, item: str, arguments: ocp.args.CheckpointArgs) -> object:
+    """Reads one item, `state` or `about`, of the checkpoint of `step`."""
     folder = run / CHECKPOINTS / str(step)
     try:
         _check_stored_arrays(folder)
-        with _one_error(), _manager(run) as manager:
+        with _quiet_errors(), _manager(run) as manager:
             return manager.restore(step, args=ocp.args.Composite(**{item: arguments}))[item]
     except (PermissionError, MemoryError):
         raise
-    except Exception as error:  # a damaged file shows as any of a dozen types, from JSON's to tensorstore's
+    except Exception as error:  # A damaged file raises one of a dozen types, from JSON's to tensorstore's.
         earlier = [other for other in _steps(run) if other < step]
-        again = f"delete that folder and go on from {max(earlier, default=0)}: vsearch train --out {run} --resume"
-        remedy = again if earlier else "there is no other; train anew"
+        resume = (
+            f"move that folder out of {run / CHECKPOINTS} and resume from iteration {max(earlier, default=0)}: "
+            f"vsearch train --out {run} --resume"
+        )
+        remedy = resume if earlier else "there is no other checkpoint; start a new run in another folder"
         raise CheckpointError(f"checkpoint {folder} is damaged ({_first_line(error)}); {remedy}") from error
 
 
 @contextlib.contextmanager
-def _one_error() -> Iterator[None]:
-    # Of the arrays that orbax writes at once the first that fails raises. It also logs a traceback for each of its
-    # threads, and the arrays still under way find their event loop closed, which Python reports as unraisable.
+def _quiet_errors() -> Iterator[None]:
+    """Silences what orbax and asyncio print beside the exception that a failed read or write raises."""
+    # Orbax writes arrays concurrently, and the first that fails raises. Orbax also logs a traceback for each thread.
+    # The other arrays find their event loop closed, and Python reports that as an unraisable exception.
     logs, hook = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
     levels = [log.level for log in logs]
     for log in logs:
         log.setLevel(logging.CRITICAL)
     sys.unraisablehook = lambda report: None if str(report.exc_value) == "Event loop is closed" else hook(report)
     yield
-    # After an error both stay: the last of those threads may end, and its traceback come, long after this block.
+    # Not in a `finally`: after an error the threads may end, and print, long after this block.
     sys.unraisablehook = hook
     for log, level in zip(logs, levels, strict=True):
         log.setLevel(level)
 
 
 def _check_stored_arrays(folder: Path) -> None:
-    # orbax reads arrays concurrently; where one fails, the callbacks of the others later print tracebacks from threads.
+    """Reads every stored array once, one after the other, and raises at the first that is damaged."""
+    # Orbax reads arrays concurrently. If one is damaged, the threads of the others print tracebacks.
     store = tensorstore.KvStore.open({"driver": "ocdbt", "base": f"file://{(folder / 'state').absolute()}/"}).result()
     for read in [store.read(name) for name in store.list().result()]:
         read.result()
 
 
-def _named_leaves(tree: Any) -> dict[str, Any]:
+def _named_leaves(tree: object) -> dict[str, jax.Array]:
+    """Returns the leaves of a pytree by their path. They may be `jax.ShapeDtypeStruct` in place of arrays."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def _not_empty(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    # orbax refuses arrays without entries; their shape and type, which the template knows, are all there is to them.
+def _nonempty(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Removes arrays without entries, which orbax refuses. The template holds their shape and dtype."""
     return {name: array for name, array in arrays.items() if array.size > 0}
 
 
-def _is_key(leaf: Any) -> bool:
+def _is_key(leaf: jax.Array) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _data(leaf: Any) -> Any:
+def _data(leaf: jax.Array) -> jax.Array:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _leaf(stored: np.ndarray, key_impl: str | None) -> jax.Array:
+def _to_leaf(stored: np.ndarray, key_impl: str | None) -> jax.Array:
     array = jnp.array(stored)
     return array if key_impl is None else jax.random.wrap_key_data(array, impl=key_impl)
 
 
-def _describe(array: Any) -> list[Any]:
-    return [list(array.shape), str(array.dtype)]
+def _shape_and_dtype(array: np.ndarray | jax.Array) -> Described:
+    return list(array.shape), str(array.dtype)
 
 
-def _as_json(values: dict[str, Any]) -> dict[str, Any]:
+def _as_json(values: Mapping[str, object]) -> dict[str, object]:
     return json.loads(json.dumps(values))
 
 
-def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def _flatten(values: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """Returns nested dictionaries as one, with dotted names."""
+    flat: dict[str, object] = {}
     for name, value in values.items():
         flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return flat

@@ -1,4 +1,7 @@
-"""A run's folder on disk: never silently reused, its files replaced whole or not at all."""
+"""The folder of a run: names of its files, creation, lock, config and seed.
+
+This module does not import JAX, so that the command line can use it and start fast.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,13 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.runs.atomic import write_atomically
 
 try:
     import fcntl
-except ImportError:  # not on Windows, where two processes on one folder go unnoticed
+except ImportError:  # Windows has no fcntl. There, two processes can write into one folder.
     fcntl = None
 
 CONFIG = "config.json"
@@ -24,36 +26,46 @@ CHECKPOINTS = "checkpoints"
 METRICS = "metrics.jsonl"
 EVENTS = "tensorboard"
 
-
 MAX_SEED = 2**32 - 1
-"""Seeds are numbers of 32 bits: jax would cut a larger one, and two seeds would be one."""
+"""Largest seed. JAX keeps 32 bits of a seed, so a larger seed would give the same run as a smaller one."""
+
+_REMEDY = "restore the file from a copy, or train into another folder"
+_NUM_REMOVALS, _SECONDS_BETWEEN_REMOVALS = 40, 0.05
 
 
 class RunError(ValueError):
-    """A run's folder is in the way, missing or incomplete; the message says which and what to do."""
+    """The folder of a run exists already, is missing, is incomplete or is in use. The message names the remedy."""
+
+
+class ConfigFileError(ConfigError):
+    """The file `config.json` of a run is damaged, or a value in it is out of range. The message names the remedy."""
 
 
 def make_new_folder(folder: Path) -> None:
-    """Makes the folder `folder` for new files; an empty one that exists will do.
+    """Makes the folder for new files, such as a run or an export. An existing empty folder is accepted.
 
     Raises:
-      RunError: the folder holds something, or a file stands in its place.
+      RunError: the folder is not empty, or `folder` is a file.
     """
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         is_run = (folder / CONFIG).is_file()
-        hint = f", or go on with the run in it: vsearch train --out {folder} --resume" if is_run else ""
+        hint = f", or continue the run in it: vsearch train --out {folder} --resume" if is_run else ""
         raise RunError(f"{folder} exists; name another folder with --out{hint}")
     folder.mkdir(parents=True, exist_ok=True)
 
 
 def check_new_file(path: Path, suffix: str) -> None:
-    """Checks that nothing is at `path`, where a new file is to be made, and makes its folder.
+    """Checks that a new file can be made at `path`, and makes the folder for it.
+
+    Args:
+      path: the file to be made.
+      suffix: how the name of the file must end, for example ".mp4".
 
     Raises:
-      RunError: something is there, or the name does not end in `suffix`.
+      RunError: something exists at `path`, or the name does not end in `suffix`.
     """
     if path.suffix.lower() != suffix:
-        raise RunError(f"{path} does not end in {suffix}; name a file that does with --out")
+        raise RunError(f"{path} does not end in {suffix}; name a file that ends in {suffix} with --out")
     if path.exists():
         raise RunError(f"{path} exists; name another file with --out")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,10 +73,15 @@ def check_new_file(path: Path, suffix: str) -> None:
 
 @contextlib.contextmanager
 def new_run_folder(run: Path) -> Iterator[None]:
-    """Makes the folder `run` for a new run, and takes away what the block that is to start the run wrote if it fails.
+    """Makes the folder of a new run for a `with` block, which writes the run's first files.
+
+    If the block raises an exception, config and checkpoints are removed. The folder is then empty again.
+
+    Args:
+      run: the new folder. An existing empty folder is accepted.
 
     Raises:
-      RunError: see `make_new_folder`.
+      RunError: the folder is not empty, or `run` is a file.
     """
     make_new_folder(run)
     try:
@@ -76,20 +93,23 @@ def new_run_folder(run: Path) -> Iterator[None]:
 
 
 def _remove(folder: Path) -> None:
-    # A save that failed on one array may still write others, and may make the folder anew to do so.
-    for _ in range(40):
+    """Removes a folder into which threads of a failed save may still write."""
+    for _ in range(_NUM_REMOVALS):
         shutil.rmtree(folder, ignore_errors=True)
-        time.sleep(0.05)
+        time.sleep(_SECONDS_BETWEEN_REMOVALS)
         if not folder.exists():
             return
 
 
 @contextlib.contextmanager
 def lock_folder(run: Path) -> Iterator[None]:
-    """Keeps other processes out of the folder `run`, if there is one, for as long as the block or this process lives.
+    """Locks the folder of a run against other processes until the `with` block ends.
+
+    The lock also ends with this process. Nothing is locked if the folder does not exist, or if the system or the file
+    system has no locks.
 
     Raises:
-      RunError: another process is at work in the folder.
+      RunError: another process has locked the folder.
     """
     if fcntl is None or not run.is_dir():
         yield
@@ -99,54 +119,64 @@ def lock_folder(run: Path) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise RunError(
-                f"another process is at work in {run}; wait for it or stop it, or name another folder"
-            ) from error
+            raise RunError(f"another process uses {run}; wait for it or stop it, or name another folder") from error
         except OSError:
-            pass  # a file system without locks
+            pass  # The file system has no locks.
         yield
     finally:
         os.close(descriptor)
 
 
 def write_config(run: Path, config: Config, seed: int) -> None:
-    """Writes `config.json`, the run's seed in it; the other half are `read_config` and `read_seed`."""
+    """Writes config and seed of a run to `config.json` in the run's folder.
+
+    Args:
+      run: folder of the run.
+      config: the run's config.
+      seed: the run's seed, from 0 to `MAX_SEED`.
+
+    Raises:
+      OSError: the disk is full or not writable.
+    """
     write_atomically(run / CONFIG, json.dumps({"seed": seed, **config.to_dict()}, indent=2) + "\n")
 
 
 def read_config(run: Path) -> Config:
-    """Returns the config of the run in the folder `run`.
+    """Reads the config of a run from `config.json` in the run's folder.
 
     Raises:
-      RunError: there is no such folder, or no run in it.
-      ConfigError: config.json is damaged or holds a value out of its range.
+      RunError: the folder holds no run.
+      ConfigFileError: `config.json` is damaged, or a value in it is out of range.
     """
-    values = {name: value for name, value in _read(run).items() if name != "seed"}
+    values = {name: value for name, value in _read_json(run).items() if name != "seed"}
     try:
         return Config.from_dict(values)
-    except (ValueError, TypeError, AttributeError) as error:  # out of its range, or of another type
-        raise ConfigError(f"{run / CONFIG}: {error}; {_REPAIR}") from error
+    except (ValueError, TypeError, AttributeError) as error:  # a value is out of range or has a wrong type
+        raise ConfigFileError(f"{run / CONFIG}: {error}; {_REMEDY}") from error
 
 
 def read_seed(run: Path) -> int:
-    """Returns the seed of the run in the folder `run`; raises as `read_config`."""
-    seed = _read(run).get("seed")
+    """Reads the seed of a run from `config.json` in the run's folder.
+
+    Raises:
+      RunError: the folder holds no run.
+      ConfigFileError: `config.json` is damaged, or the seed is out of range.
+    """
+    seed = _read_json(run).get("seed")
     if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
-        raise ConfigError(f"{run / CONFIG}: seed is {seed!r}, no whole number from 0 to {MAX_SEED}; {_REPAIR}")
+        raise ConfigFileError(f"{run / CONFIG}: seed is {seed!r}; allowed: 0 to {MAX_SEED}; {_REMEDY}")
     return seed
 
 
-_REPAIR = "restore it, or train into another folder"
-
-
-def _read(run: Path) -> dict[str, Any]:
+def _read_json(run: Path) -> dict[str, object]:
+    """Reads the object in `config.json`."""
     path = run / CONFIG
     if not path.is_file():
         raise RunError(f"no run in {run}: {CONFIG} is missing; name a folder that `vsearch train --out` made")
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ConfigError(f"{path} is not JSON ({error}); {_REPAIR}") from error
+        raise ConfigFileError(f"{path} is not JSON ({error}); {_REMEDY}") from error
     if not isinstance(values, dict):
-        raise ConfigError(f"{path} holds no JSON object; {_REPAIR}")
+        raise ConfigFileError(f"{path} holds no JSON object; {_REMEDY}")
     return values

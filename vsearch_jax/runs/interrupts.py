@@ -1,4 +1,7 @@
-"""Interrupts: long computations that Ctrl-C can leave, and a first signal that lets the running chunk end."""
+"""Ctrl-C and SIGTERM during long computations.
+
+The first signal lets the running chunk end. The second signal stops at once.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +10,29 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import ParamSpec, TypeVar
 
 import jax
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 OnInterrupt = Callable[[], None]
-"""Called when the running chunk is to be the last."""
+"""Called at the first signal, when the running chunk becomes the last one."""
 
 
 @contextlib.contextmanager
 def stop_on_signal(on_interrupt: OnInterrupt) -> Iterator[threading.Event]:
-    """Yields an event that the block's first SIGINT or SIGTERM sets; a second one raises KeyboardInterrupt.
+    """Lets a `with` block stop in good order: handles Ctrl-C (SIGINT) and SIGTERM while the block runs.
 
-    Outside of the main thread, where Python delivers no signals, it is never set.
+    The first signal sets an event, which the block must poll. The second signal raises KeyboardInterrupt.
+    Python delivers signals to the main thread only. In another thread the event is never set.
+
+    Args:
+      on_interrupt: called at the first signal.
+
+    Yields:
+      The event that the first signal sets.
     """
     event = threading.Event()
 
@@ -29,7 +40,7 @@ def stop_on_signal(on_interrupt: OnInterrupt) -> Iterator[threading.Event]:
         if event.is_set():
             raise KeyboardInterrupt
         event.set()
-        with contextlib.suppress(RuntimeError):  # the signal may have come within a print
+        with contextlib.suppress(RuntimeError):  # The signal may arrive inside a print, which cannot be entered twice.
             on_interrupt()
 
     if threading.current_thread() is not threading.main_thread():
@@ -43,17 +54,28 @@ def stop_on_signal(on_interrupt: OnInterrupt) -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def call_interruptibly(function: Callable[..., T], *arguments: Any) -> T:
-    """Returns `function(*arguments)` with its arrays computed; unlike a plain call it can be interrupted at once.
+def call_interruptibly(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Calls `function(*args, **kwargs)` so that Ctrl-C or SIGTERM can interrupt the call at once.
 
-    A signal's handler runs in the main thread only, and there only between two steps of Python, while one call of a
-    compiled function may take hours. So the call is made in another thread, which an interrupt leaves behind.
+    Python runs a signal handler in the main thread, between two Python instructions. A call of a compiled function is
+    one instruction and may take hours. So the call runs in another thread. An interrupt abandons that thread.
+
+    Args:
+      function: the function to call.
+      *args: positional arguments of the function.
+      **kwargs: keyword arguments of the function.
+
+    Returns:
+      The function's result, after all arrays in it are computed.
+
+    Raises:
+      BaseException: the exception that the function raised, or that a signal handler raised.
     """
     future: concurrent.futures.Future[T] = concurrent.futures.Future()
 
     def call() -> None:
         try:
-            future.set_result(jax.block_until_ready(function(*arguments)))
+            future.set_result(jax.block_until_ready(function(*args, **kwargs)))
         except BaseException as error:
             future.set_exception(error)
 

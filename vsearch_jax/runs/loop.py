@@ -1,7 +1,7 @@
-"""A run from start to report: the host's loop of equal chunks, saving and reporting between them.
+"""A run from start to evaluation: the host calls `train` once for each chunk and saves after each chunk.
 
-After each chunk its metrics go to the disk first, then the checkpoint; whatever kills the run in between, the run goes
-on from the last checkpoint, and metrics past it are dropped. So the run needs no care at an interrupt.
+After a chunk, its metrics are written first, then its checkpoint. A crash between the two loses nothing: the run
+resumes from the last checkpoint, and metrics of later iterations are removed.
 """
 
 from __future__ import annotations
@@ -13,94 +13,121 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from vsearch_jax.config import Config, ConfigError
-from vsearch_jax.evaluation import check_target, evaluate, record_search
+from vsearch_jax.evaluation import Outcome, check_target, evaluate, record_search
 from vsearch_jax.runs import checkpoint
 from vsearch_jax.runs.folder import MAX_SEED, RunError, new_run_folder, read_config, read_seed, write_config
 from vsearch_jax.runs.interrupts import OnInterrupt, call_interruptibly, stop_on_signal
-from vsearch_jax.runs.metrics_log import STAGES, MetricsLog, read_metrics
+from vsearch_jax.runs.metrics_log import STAGES, MetricsLine, MetricsLog, read_metrics
 from vsearch_jax.training import init, train
 from vsearch_jax.types import ReachabilityMap, TrainState
 
+OnChunk = Callable[[int, float, Sequence[MetricsLine]], None]
+"""(number of iterations done, wall time of the chunk in s, the chunk's lines of `metrics.jsonl`) -> None."""
+
+
+def _ignore(*_: object) -> None:
+    """Does nothing."""
+
 
 def start_run(run: Path, config: Config, seed: int) -> TrainState:
-    """Makes the folder `run` and returns the state at the start, saved there as the checkpoint of step 0.
+    """Starts a new run: makes its folder, computes the untrained state, and saves this state as the first checkpoint.
 
-    If that fails the folder is left empty.
+    If this fails, the folder is left empty.
+
+    Args:
+      run: folder of the run; a folder that does not exist yet, or an empty one.
+      config: the run's config.
+      seed: seed of all random numbers of the run, from 0 to `MAX_SEED`.
+
+    Returns:
+      The state before any training.
 
     Raises:
-      RunError: the folder exists and holds something.
-      ConfigError, SceneError: the config or the seed can't be run.
+      RunError: the folder is not empty.
+      ConfigError: the seed is out of range, or the arm cannot reach the target view.
+      SceneError: the arm or the object cannot be loaded.
       OSError: the disk is full or not writable.
     """
     if not 0 <= seed <= MAX_SEED:
         raise ConfigError(f"seed is {seed}; allowed: 0 to {MAX_SEED}")
     with new_run_folder(run):
         state = call_interruptibly(init, jax.random.key(seed), config)
-        check_target(state.reach, config)  # now, not when the training is done
+        # Only the evaluation needs the target. Checked here, the error comes before the training, not after it.
+        check_target(state.reach, config)
         write_config(run, config, seed)
         checkpoint.save(run, state, config)
     return state
 
 
 def resume_run(run: Path, config: Config) -> TrainState:
-    """Returns the state of the last checkpoint in the folder `run`.
+    """Loads the state from which an interrupted run continues: the run's last checkpoint.
+
+    Args:
+      run: folder of the run.
+      config: the run's config. Fields that only the evaluation reads may differ; then `config.json` is written again.
+
+    Returns:
+      The state of the last checkpoint.
 
     Raises:
-      RunError: there is no run in the folder.
-      CheckpointError: the checkpoint is missing, damaged or of another config.
-      ConfigError: the arm can't reach the target view.
+      RunError: the folder holds no run.
+      CheckpointError: the checkpoint is missing, damaged, or belongs to another config or version.
+      ConfigError: the arm cannot reach the target view.
     """
     saved, seed = read_config(run), read_seed(run)
     template = jax.eval_shape(lambda key: init(key, config), jax.random.key(0))
     state = checkpoint.restore(run, template, config)
     check_target(state.reach, config)
-    if saved != config:  # in what only evaluation reads
+    if saved != config:
         write_config(run, config, seed)
     return state
 
 
-OnChunk = Callable[[int, float, Sequence[Mapping[str, Any]]], None]
-"""Takes iterations done, the chunk's wall time in s and its lines of metrics.jsonl."""
-
-
 def train_to_end(
-    run: Path, state: TrainState, config: Config, on_chunk: OnChunk, on_interrupt: OnInterrupt = lambda: None
+    run: Path,
+    state: TrainState,
+    config: Config,
+    on_chunk: OnChunk = _ignore,
+    on_interrupt: OnInterrupt = _ignore,
 ) -> TrainState:
-    """Trains from `state` to the end of the run, saving after each chunk.
+    """Trains to the end of the run, and saves a checkpoint after each chunk of iterations.
 
-    An interrupt lets the running chunk end and saves it; a second one leaves it at once.
+    At a first SIGINT or SIGTERM the running chunk ends and is saved. A second signal stops at once.
 
     Args:
-      run: the run's folder.
-      state: from `start_run` or `resume_run`; donated.
+      run: folder of the run.
+      state: from `start_run` or `resume_run`. The state is donated, so it cannot be used again.
       config: the run's config.
       on_chunk: called after each chunk is saved.
-      on_interrupt: called at the first interrupt.
+      on_interrupt: called at the first signal.
+
+    Returns:
+      The state at the end of the run.
 
     Raises:
-      KeyboardInterrupt: the run was interrupted; the last checkpoint holds what was saved.
-      RunError: the training diverged, or metrics.jsonl is damaged.
-      OSError: the disk is full or not writable; the last checkpoint stays.
+      KeyboardInterrupt: a signal stopped the run. The last checkpoint holds the saved iterations.
+      RunError: the training diverged, or `metrics.jsonl` is damaged.
+      OSError: the disk is full or not writable. The last checkpoint stays.
     """
-    with stop_on_signal(on_interrupt) as is_stopping:
-        return _train_chunks(run, state, config, on_chunk, is_stopping)
+    with stop_on_signal(on_interrupt) as stop_requested:
+        return _train_chunks(run, state, config, on_chunk, stop_requested)
 
 
 def _train_chunks(
-    run: Path, state: TrainState, config: Config, on_chunk: OnChunk, is_stopping: threading.Event
+    run: Path, state: TrainState, config: Config, on_chunk: OnChunk, stop_requested: threading.Event
 ) -> TrainState:
     step = int(state.step)
     log = MetricsLog(run, step)
     while step < config.num_iterations:
-        began = time.perf_counter()
+        start_time = time.perf_counter()
         state, metrics = call_interruptibly(train, state, config)
-        seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - start_time
         new_step = int(state.step)
         # The last chunk may be shorter than its arrays.
         columns = {name: np.asarray(column)[: new_step - step] for name, column in metrics.items()}
@@ -109,81 +136,114 @@ def _train_chunks(
         checkpoint.save(run, state, config)
         on_chunk(new_step, seconds, log.lines[step - new_step :])
         step = new_step
-        if is_stopping.is_set():
+        if stop_requested.is_set():
             raise KeyboardInterrupt
     log.close()
     return state
 
 
 def check_finite(run: Path, columns: Mapping[str, np.ndarray], step: int, config: Config) -> None:
-    """Raises RunError where the training diverged in a chunk that began at iteration `step`; nothing of it is saved."""
+    """Checks that losses and rewards of a chunk of n iterations are finite. Called before the chunk is saved.
+
+    Args:
+      run: folder of the run, for the error message.
+      columns: f32[n] for each metric of the chunk, one value for each iteration.
+      step: number of the chunk's first iteration.
+      config: the run's config.
+
+    Raises:
+      RunError: the training diverged.
+    """
     number = step + np.arange(len(columns["stage"])) - config.encoder.num_updates
     is_encoder, is_policy = number < 0, number >= 0
     is_updated = number * config.sac.num_envs >= config.sac.num_warmup_steps
-    checks = {"encoder_loss": is_encoder, "reward": is_policy, "critic_loss": is_updated, "actor_loss": is_updated}
-    for name, is_there in checks.items():
-        if not np.isfinite(columns[name][is_there]).all():
+    rows_of_metric = {
+        "encoder_loss": is_encoder,
+        "reward": is_policy,
+        "critic_loss": is_updated,
+        "actor_loss": is_updated,
+    }
+    for name, rows in rows_of_metric.items():
+        if not np.isfinite(columns[name][rows]).all():
+            section = "EncoderConfig" if name == "encoder_loss" else "SACConfig"
             raise RunError(
-                f"{run}: {name} is not finite after iteration {step}: the training diverged, and that is not saved; "
-                f"start anew with a smaller {'encoder' if name == 'encoder_loss' else 'sac'}.learning-rate"
+                f"{run}: the training diverged: {name} is not finite in the chunk that starts at iteration {step}, "
+                f"which is not saved; start a new run with a smaller {section}.learning_rate"
             )
 
 
 class Evaluated(NamedTuple):
-    """What a report is made of.
+    """Everything that the report of a run needs.
 
     Attributes:
-      arrays: what `evaluate` returns.
-      search: what `record_search` returns, as numpy arrays.
-      reach: the arm's reachability map.
-      lines: the lines of metrics.jsonl.
+      arrays: measures of each searcher, from `evaluate`.
+      search: images of one search, from `record_search`, as numpy arrays.
+      reach: the views that the arm reaches.
+      lines: lines of `metrics.jsonl`.
       wall_seconds: wall time in s of each stage of the run.
-      seed: of the run.
+      seed: the run's seed.
     """
 
-    arrays: dict[str, Any]
+    arrays: dict[str, Outcome]
     search: dict[str, np.ndarray]
     reach: ReachabilityMap
-    lines: list[dict[str, Any]]
+    lines: list[MetricsLine]
     wall_seconds: dict[str, float]
     seed: int
 
 
 def evaluate_run(run: Path, state: TrainState, config: Config) -> Evaluated:
-    """Evaluates a trained state.
+    """Evaluates a finished run: measures all searchers, and records the images of one search.
 
     Args:
-      run: the run's folder.
-      state: of the run.
-      config: the run's, but for what `evaluate` lets differ.
+      run: folder of the run.
+      state: the run's last state.
+      config: the run's config. Fields that `evaluate` lets differ may differ.
+
+    Returns:
+      The measures, the recorded search, and the metrics of the training.
 
     Raises:
       RunError: the run is not finished.
-      ConfigError: the arm can't reach the target view.
+      ConfigError: the arm cannot reach the target view.
     """
     check_finished(run, state, config)
     lines, seed = read_metrics(run), read_seed(run)
-    release_memory()  # of the compiled training, some GiB
-    began = time.perf_counter()
+    release_memory()  # The compiled training holds some GiB.
+    start_time = time.perf_counter()
     arrays = call_interruptibly(evaluate, state, config)
     wall_seconds: dict[str, float] = {
         stage: sum(line["seconds"] for line in lines if line["stage"] == stage) for stage in STAGES
     }
-    wall_seconds["evaluation"] = time.perf_counter() - began
+    wall_seconds["evaluation"] = time.perf_counter() - start_time
     search = jax.tree.map(np.asarray, call_interruptibly(record_search, state, config))
     return Evaluated(arrays, search, state.reach, lines, wall_seconds, seed)
 
 
 def check_finished(run: Path, state: TrainState, config: Config) -> None:
-    """Raises RunError where the run in the folder `run`, its state given, has iterations left."""
-    step, end = int(state.step), config.num_iterations
-    if step < end:
-        raise RunError(f"{run} has done {step} of {end} iterations; finish it: vsearch train --out {run} --resume")
+    """Checks that the training of a run is finished: all iterations of the config are done.
+
+    Args:
+      run: folder of the run, for the error message.
+      state: the run's last state.
+      config: the run's config.
+
+    Raises:
+      RunError: the run is not finished.
+    """
+    step, num_iterations = int(state.step), config.num_iterations
+    if step < num_iterations:
+        raise RunError(
+            f"{run} has done {step} of {num_iterations} iterations; finish the run: vsearch train --out {run} --resume"
+        )
 
 
 def release_memory() -> None:
-    """Drops compiled programs and hands their memory back to the system, which glibc does not do by itself."""
+    """Deletes all programs that JAX has compiled, and returns the memory to the operating system.
+
+    The GNU C library keeps freed memory until it is asked to return it. With another C library this step is skipped.
+    """
     jax.clear_caches()
     gc.collect()
-    with contextlib.suppress(AttributeError, OSError):  # another C library
+    with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,4 +1,4 @@
-"""The metrics of a run on disk: metrics.jsonl and TensorBoard's events; after a resume each iteration is there once."""
+"""The metrics of a run on disk: `metrics.jsonl` and TensorBoard events. Each iteration has exactly one line."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from tensorboardX import SummaryWriter
@@ -15,12 +15,20 @@ from tensorboardX import SummaryWriter
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.folder import EVENTS, METRICS, RunError
 
+MetricsLine: TypeAlias = dict[str, Any]
+"""One line of `metrics.jsonl`: `iteration` int, `stage` str, `seconds` float, and a float for each metric."""
+
 STAGES = ("encoder", "policy")
-"""Names of the values of the metric `stage`."""
+"""Names of the stages. The metric `stage` is an index into this tuple."""
 
 
-def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Returns the complete lines of `metrics.jsonl`, one dict an iteration; empty where there are none.
+def read_metrics(run: Path) -> list[MetricsLine]:
+    """Reads the training metrics of a run from `metrics.jsonl` in the run's folder.
+
+    A killed process may leave an incomplete last line, which is ignored.
+
+    Returns:
+      One dictionary for each iteration; an empty list if there is no file.
 
     Raises:
       RunError: a complete line is damaged.
@@ -28,49 +36,64 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     path = run / METRICS
     if not path.is_file():
         return []
-    text = path.read_text(encoding="utf-8", errors="replace")  # what is no text is no JSON either
-    whole = text[: text.rfind("\n") + 1]  # a killed write leaves a last line without its end
-    return [_parse(path, number, line) for number, line in enumerate(whole.splitlines(), 1)]
+    # Damaged bytes become replacement characters, which are not valid JSON.
+    text = path.read_text(encoding="utf-8", errors="replace")
+    complete = text[: text.rfind("\n") + 1]
+    return [_parse_line(path, number, line) for number, line in enumerate(complete.splitlines(), 1)]
 
 
-def _parse(path: Path, number: int, text: str) -> dict[str, Any]:
-    error = RunError(f"{path}: line {number} is damaged; restore the file, or delete that line")
+def _parse_line(path: Path, number: int, text: str) -> MetricsLine:
+    error = RunError(f"{path}: line {number} is damaged; restore the file from a copy, or train into another folder")
     try:
         line = json.loads(text)
-        is_whole = line["stage"] in STAGES and isinstance(line["iteration"], int) and line["seconds"] >= 0.0
+        is_valid = line["stage"] in STAGES and isinstance(line["iteration"], int) and line["seconds"] >= 0.0
     except (ValueError, TypeError, KeyError):
         raise error from None
-    if not is_whole:
+    if not is_valid:
         raise error
     return line
 
 
 class MetricsLog:
-    """Appends metrics to `metrics.jsonl` and to TensorBoard's events.
+    """Appends training metrics to the files of a run: `metrics.jsonl` and TensorBoard events.
 
     Attributes:
-      lines: every line of `metrics.jsonl`: `iteration`, `stage`, `seconds` (wall time) and the stage's metrics.
+      lines: all lines of `metrics.jsonl`.
     """
 
+    lines: list[MetricsLine]
+
     def __init__(self, run: Path, step: int) -> None:
-        """Opens the logs in the folder `run` to go on at iteration `step`; what they hold of later ones is dropped."""
+        """Opens the logs. Lines of iteration `step` and later are removed.
+
+        Args:
+          run: folder of the run.
+          step: number of iterations done.
+
+        Raises:
+          RunError: a line of `metrics.jsonl` is damaged.
+          OSError: the disk is full or not writable.
+        """
         self.lines = [line for line in read_metrics(run) if line["iteration"] < step]
         self._path = run / METRICS
         write_atomically(self._path, "".join(json.dumps(line) + "\n" for line in self.lines))
         self._events = SummaryWriter(str(run / EVENTS), purge_step=step)
 
     def append(self, metrics: Mapping[str, np.ndarray], first: int, seconds: float) -> None:
-        """Appends one line for each iteration of a chunk and returns when they are on disk.
+        """Appends the metrics of a chunk of n iterations, one line for each, and waits until the lines are on disk.
 
         Args:
-          metrics: `stage` i32[n] (place in `STAGES`) and f32[n] under each other name, NaN where the stage lacks it.
+          metrics: `stage` i32[n], index into `STAGES`; each other metric f32[n], NaN in iterations of another stage.
           first: number of the chunk's first iteration.
-          seconds: wall time of the chunk.
+          seconds: wall time of the chunk in s. Each line gets an equal share.
+
+        Raises:
+          OSError: the disk is full or not writable.
         """
         stages = metrics["stage"]
         new = []
         for i, stage in enumerate(stages):
-            line: dict[str, Any] = {"iteration": first + i, "stage": STAGES[stage], "seconds": seconds / len(stages)}
+            line: MetricsLine = {"iteration": first + i, "stage": STAGES[stage], "seconds": seconds / len(stages)}
             values = {name: float(column[i]) for name, column in metrics.items() if name != "stage"}
             # JSON has no NaN.
             line |= {name: value for name, value in values.items() if math.isfinite(value)}
@@ -86,5 +109,5 @@ class MetricsLog:
         self.lines += new
 
     def close(self) -> None:
-        """Closes TensorBoard's events."""
+        """Closes the TensorBoard events file. `metrics.jsonl` needs no closing."""
         self._events.close()
