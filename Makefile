@@ -13,6 +13,7 @@ first_python = $(shell for python in $(2); do \
 PYTHON ?= $(call first_python,11,python3 python3.11 python3.12 python3.13)
 PYTHON_NEWEST ?= $(call first_python,12,python3.12 python3.13 python3 $(wildcard $(HOME)/.pyenv/versions/3.12*/bin/python))
 PRESET ?= cpu
+CONSTRAINTS_NEWEST ?= constraints-newest.txt
 RUN ?= runs/$(PRESET)-$(shell date +%Y%m%d-%H%M%S)
 PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
 
@@ -56,10 +57,10 @@ test-slow: setup
 test-newest: $(SETUP_NEWEST)
 	$(VENV_NEWEST)/bin/python -m pytest $(PYTEST_ARGS)
 
-$(SETUP_NEWEST): pyproject.toml constraints-newest.txt
+$(SETUP_NEWEST): pyproject.toml $(CONSTRAINTS_NEWEST)
 	@test -n "$(PYTHON_NEWEST)" || { echo "make: no Python >= 3.12 found; name one: make test-newest PYTHON_NEWEST=/path/to/python3.12" >&2; exit 2; }
 	$(PYTHON_NEWEST) -m venv $(VENV_NEWEST)
-	$(VENV_NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-newest.txt -e '.[dev]'
+	$(VENV_NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS_NEWEST) -e '.[dev]'
 	@touch $@
 
 clean:

@@ -1,0 +1,56 @@
+"""Inverse kinematics and RRT-Connect per second against batch size and number of lanes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+from gpu_sections.measure import Row, Settings, measure, sweep
+from vsearch_jax.config import IKConfig, PlanningConfig, SceneConfig
+from vsearch_jax.planning import ik, lane_counts, rrt_connect
+from vsearch_jax.robot.arm import Arm, build_arm, camera_pose, forward_kinematics, is_free
+from vsearch_jax.scene import build_scene
+
+
+def run(settings: Settings) -> Iterator[Row]:
+    """Yields rows of IK, then of RRT-Connect among posts, then of RRT-Connect with other numbers of lanes."""
+    batches = [16] if settings.is_quick else [64, 1024, 16384]
+    arm = build_arm(build_scene(SceneConfig()))
+    yield from sweep(batches, lambda batch: _ik(arm, batch, settings), settings)
+    cluttered = build_arm(build_scene(SceneConfig(obstacles="posts")))
+    batches = [8] if settings.is_quick else [64, 512, 4096]
+    yield from sweep(batches, lambda batch: _rrt(cluttered, batch, settings), settings)
+    for num_lanes in [] if settings.is_quick else [64, 512, 2048]:
+        with lane_counts.override(rrt=num_lanes):
+            yield {"lanes": num_lanes} | _rrt(cluttered, batches[-1], settings)
+    for num_lanes in [] if settings.is_quick else [256, 2048, 16384]:
+        with lane_counts.override(ik=num_lanes):
+            yield {"lanes": num_lanes} | _ik(arm, 16384, settings)
+
+
+def random_configurations(arm: Arm, seed: int, count: int) -> np.ndarray:
+    """Returns f32[count, nq] inside the limits; joints that do not move the camera are at home."""
+    joints = np.random.default_rng(seed).uniform(arm.lower, arm.upper, (count, len(arm.lower))).astype(np.float32)
+    others = np.setdiff1d(np.arange(joints.shape[1]), arm.chain.address)
+    joints[:, others] = np.asarray(arm.home)[others]
+    return joints
+
+
+def _ik(arm: Arm, batch: int, settings: Settings) -> Row:
+    config = IKConfig()
+    wanted, present = random_configurations(arm, 1, batch), random_configurations(arm, 2, batch)
+    poses = jax.jit(jax.vmap(lambda q: camera_pose(arm, forward_kinematics(arm, q))))(wanted)
+    return measure("IK", batch, settings, jax.vmap(lambda pose, q: ik(arm, pose, q, config)), poses, present)
+
+
+def _rrt(arm: Arm, batch: int, settings: Settings) -> Row:
+    config = PlanningConfig()
+    joints = random_configurations(arm, 5, 16 * batch)
+    is_clear = jax.jit(jax.vmap(lambda q: is_free(arm, forward_kinematics(arm, q))))(joints)
+    joints = joints[np.asarray(is_clear)]
+    start, goal = np.resize(joints[::2], (batch, joints.shape[1])), np.resize(joints[1::2], (batch, joints.shape[1]))
+    keys = jax.random.split(jax.random.key(0), batch)
+    plan = jax.vmap(lambda key, a, b: rrt_connect(arm, key, a, b, config))
+    return measure("RRT-Connect, posts", batch, settings, plan, keys, start, goal)

@@ -1,0 +1,31 @@
+"""`train` and `evaluate` compile for accelerators that this machine does not have, up to the compiler's own input."""
+
+import dataclasses
+import functools
+import re
+
+import jax
+import jax.export
+import pytest
+
+import vsearch_jax as vs
+
+# One seed, silhouettes: everything that loops is there, and less is traced.
+_SMOKE = vs.Config.preset("smoke")
+CONFIG = dataclasses.replace(_SMOKE, encoder=dataclasses.replace(_SMOKE.encoder, input="silhouette"))
+
+
+@pytest.fixture(scope="module")
+def state():
+    return jax.eval_shape(functools.partial(vs.init, config=CONFIG), jax.random.key(0))
+
+
+@pytest.mark.parametrize("function", [vs.train, vs.evaluate], ids=["train", "evaluate"])
+def test_a_whole_run_lowers_for_cuda_and_tpu(function, state) -> None:
+    program = jax.jit(functools.partial(function, config=CONFIG))
+    exported = jax.export.export(program, platforms=("cuda", "tpu"))(state)
+    assert exported.platforms == ("cuda", "tpu")
+    text = exported.mlir_module()
+    assert len(re.findall(r"stablehlo\.while", text)) > 50
+    # A callback would run on the host at every step.
+    assert "callback" not in text
