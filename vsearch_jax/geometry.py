@@ -13,28 +13,35 @@ from vsearch_jax.types import View
 
 
 def wrap_angle(angle: Array) -> Array:
-    """Returns `angle` (rad, any shape) wrapped into [-pi, pi)."""
+    """Adds a multiple of 2 pi to each angle, so that it lies in [-pi, pi).
+
+    Args:
+      angle: f32[...] rad.
+
+    Returns:
+      The wrapped angles, f32[...] rad.
+    """
     return jnp.mod(angle + jnp.pi, 2.0 * jnp.pi) - jnp.pi
 
 
 def angle_difference(a: Array, b: Array) -> Array:
-    """Returns the signed shortest rotation from angle `b` to angle `a`, in rad, in [-pi, pi).
+    """Returns the shortest rotation from angle `b` to angle `a`, with its sign, in rad, in [-pi, pi).
 
     Args:
-      a: f32[...] rad.
-      b: f32[...] rad.
+      a: f32[...] rad, final angles.
+      b: f32[...] rad, initial angles.
     """
     return wrap_angle(a - b)
 
 
 def view_pose(view: View, center: Array, radius: float | Array) -> SE3:
-    """Returns `T_world_camera` of the camera that looks at `center` from `view`.
+    """Returns the camera's pose in world (T_world_camera) for a view: the camera looks at `center`, image upright.
 
     The camera's x axis is horizontal and points in the direction of growing azimuth. So the pose is defined at the pole
     too: it is the limit along the meridian of the azimuth.
 
     Args:
-      view: View of f32[] rad.
+      view: azimuth and elevation of the camera on the view sphere, f32[] rad each.
       center: f32[3] m, centre of the view sphere in world.
       radius: f32[] m, radius of the view sphere.
     """
@@ -49,10 +56,10 @@ def view_pose(view: View, center: Array, radius: float | Array) -> SE3:
 
 
 def rotation_error(a: Array, b: Array) -> Array:
-    """Returns the geodesic angle between two rotations, f32[...] rad in [0, pi].
+    """Returns the angle of the rotation that leads from one rotation to another, f32[...] rad in [0, pi].
 
-    It is atan2 of the angle's sine and cosine, both from R = A^T B. The usual arccos of the trace loses half of the
-    digits near 0.
+    This geodesic angle is atan2 of its sine and cosine, both from R = A^T B. The usual arccos of the trace loses half
+    of the digits near 0.
 
     Args:
       a: f32[..., 3, 3], rotation matrices A.
@@ -82,11 +89,13 @@ def frobenius_angle(a: Array, b: Array) -> Array:
 
 
 def cosine_similarity(a: Array, b: Array) -> Array:
-    """Returns the cosine of the angle between two codes, f32[...]; 0 where a code is all zeros.
+    """Returns the cosine of the angle between two codes (vectors that the encoder makes of images).
+
+    The cosine is f32[...]. It is 0 where a code is all zeros.
 
     Args:
-      a: f32[..., Z].
-      b: f32[..., Z].
+      a: f32[..., Z], codes of Z numbers each.
+      b: f32[..., Z], codes of Z numbers each.
     """
     norms = jnp.sqrt(jnp.maximum(jnp.sum(a * a, axis=-1) * jnp.sum(b * b, axis=-1), 1e-24))
     return jnp.sum(a * b, axis=-1) / norms

@@ -52,7 +52,7 @@ class _PolicyCarry(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Array, config: Config) -> TrainState:
-    """Returns the state at the start of a run, the arm's reachability map included.
+    """Computes the state at the start of a run: reachability map of the arm, untrained encoder and untrained policies.
 
     Args:
       key: PRNG key; all random numbers of the run come from it.
@@ -86,16 +86,18 @@ def init(key: Array, config: Config) -> TrainState:
 
 
 def train(state: TrainState, config: Config) -> tuple[TrainState, Metrics]:
-    """Runs one chunk of the run; with `num_chunks=1` this is the whole run. After the last chunk it changes nothing.
+    """Trains for one chunk: a fixed number of iterations, `config.chunk_length`. Call it until the run is done.
+
+    With `num_chunks=1` one call is the whole run. After the end of the run a call changes nothing.
 
     Args:
       state: from `init` or an earlier call. It is donated, so it cannot be used again.
       config: the run's config. The function is traced once for each config.
 
     Returns:
-      The new state, and metrics by name: f32[n], one entry for each iteration of the chunk, n = `config.chunk_length`.
+      The new state, and metrics by name: f32[n], one entry for each of the n = `config.chunk_length` iterations.
       `stage` i32[n] is 0 for encoder iterations, 1 for policy iterations and -1 after the end of the run.
-      A metric is NaN in iterations of the other stage. Metrics of the policy are means over the seeds.
+      A metric is NaN in iterations of the other stage. Metrics of the policies are means over the policy seeds.
 
     Raises:
       UnreachableError: there is no elevation that the arm reaches at every azimuth.
@@ -155,11 +157,11 @@ def encoder_iteration(
     Args:
       i: i32[], number of the update.
       encoder: the encoder before the update.
-      env: the task; its own encoder is not used.
+      env: the task, which renders the views. The encoder in it is not used.
       key: PRNG key of the encoder stage, equal for all updates.
 
     Returns:
-      The encoder after the update, and its metrics f32[].
+      The encoder after the update, and the metrics of the update by name, f32[] each.
     """
     keys = jax.random.split(jax.random.fold_in(key, i), env.config.encoder.batch_size)
     inputs, targets = jax.vmap(functools.partial(encoder_example, env=env))(keys)

@@ -22,7 +22,7 @@ ParamTree: TypeAlias = "dict[str, ParamTree | Array]"  # network parameters
 
 
 class View(NamedTuple):
-    """A camera pose on the view sphere. The camera looks at the sphere's centre, and the image is upright.
+    """A camera position on the view sphere around the object. The camera looks at the sphere's centre, image upright.
 
     Attributes:
       azimuth: f32[] rad, about world z; 0 along world +x.
@@ -52,7 +52,7 @@ class Camera:
 
 @flax.struct.dataclass
 class Image:
-    """A rendered image; row 0 is the top.
+    """A rendered image of H x W pixels; row 0 is the top.
 
     Attributes:
       rgb: f32[H, W, 3] in [0, 1].
@@ -80,8 +80,8 @@ class IKResult:
     """The solution of one inverse-kinematics problem.
 
     Attributes:
-      qpos: f32[nq] rad or m, inside the joint limits.
-      position_error: f32[] m.
+      qpos: f32[nq] rad or m, joint values inside the joint limits.
+      position_error: f32[] m, distance of the camera from the wanted position.
       rotation_error: f32[] rad, geodesic; with a free roll, the angle between the optical axes.
       is_converged: bool[], both errors are within the tolerances of the config.
       status: i32[], an IKStatus.
@@ -95,7 +95,7 @@ class IKResult:
 
 
 class PlanStatus(enum.IntEnum):
-    """Result of a planning problem; see `vsearch_jax.planning.rrt_connect`."""
+    """Result of a path-planning problem; see `vsearch_jax.planning.rrt_connect`."""
 
     FOUND = 0
     EXHAUSTED = 1
@@ -105,7 +105,7 @@ class PlanStatus(enum.IntEnum):
 
 @flax.struct.dataclass
 class Path:
-    """A piecewise straight path in joint space.
+    """A path in joint space of W waypoints, joined by straight pieces.
 
     Attributes:
       waypoints: f32[W, nq] rad or m, from start to goal, which fills the last rows. Without a path: only the start.
@@ -120,7 +120,7 @@ class Path:
 
 @flax.struct.dataclass
 class ReachabilityMap:
-    """The views of a grid that the arm can reach, with joint values for each.
+    """The views of a grid of A azimuths and E elevations that the arm can reach, with joint values for each (a cell).
 
     Attributes:
       azimuths: f32[A] rad, periodic, evenly spaced from 0.
@@ -139,7 +139,7 @@ class ReachabilityMap:
 
 @flax.struct.dataclass
 class Observation:
-    """What the wrist camera sees from one pose of the arm.
+    """What the wrist camera sees from one configuration of the arm. A code has Z numbers.
 
     Attributes:
       view: the commanded View.
@@ -160,7 +160,7 @@ class EpisodeState:
 
     Attributes:
       observation: Observation from the present view.
-      target: Observation from the target view.
+      target: Observation from the target view, which the episode searches for.
       num_steps: i32[], number of steps done in the episode.
     """
 
@@ -174,10 +174,10 @@ class Transition(NamedTuple):
 
     Attributes:
       obs: f32[D], policy input before the step.
-      action: f32[2] in [-1, 1].
+      action: f32[2] in [-1, 1], change of azimuth and elevation in units of `action_scale_deg`.
       reward: f32[].
       next_obs: f32[D], policy input after the step and before any reset.
-      terminated: f32[], 1 if the step met the threshold. No reward follows such a step.
+      terminated: f32[], 1 if the similarity to the target met the threshold. No reward follows such a step.
       is_reachable: f32[], 1 if the arm did the step; 0 if it stayed, and the reward is `unreachable_reward`.
     """
 
@@ -223,7 +223,7 @@ class SACState:
 
 @flax.struct.dataclass
 class EncoderState:
-    """The augmented autoencoder, and the mean and whitening that turn its raw latent into a code.
+    """The augmented autoencoder, and the mean and whitening that turn its raw latent of Z numbers into a code.
 
     Attributes:
       params: parameters of encoder and decoder.
@@ -240,12 +240,12 @@ class EncoderState:
 
 @flax.struct.dataclass
 class TrainState:
-    """Complete state of a run; S is the number of policy seeds.
+    """Complete state of a run; S policies are trained, one for each policy seed.
 
     Attributes:
       encoder: EncoderState.
       reach: ReachabilityMap of the arm, mount and object.
-      pool: Observation, leading axis N: random views where training episodes start; zeros until the encoder is done.
+      pool: Observation, leading axis N: N random views where training episodes start; zeros until the encoder is done.
       sac: SACState, leading axis S.
       env: brax State of the training environments, leading axes S, num_envs.
       replay: ReplayState, leading axis S.
@@ -269,8 +269,8 @@ class PolicyEnd(NamedTuple):
     Attributes:
       state: brax State at the end of the episode.
       num_helped: i32[], number of steps that the local search chose, not the policy.
-      travel: f32[] rad, sum of the metric `joint_travel` over the steps.
-      duration: f32[] s, sum of the metric `motion_time` over the steps.
+      travel: f32[] rad, length of the arm's path in joint space, summed over the steps.
+      duration: f32[] s, time of the arm's motions, summed over the steps.
     """
 
     state: State
@@ -284,11 +284,11 @@ class SearchResult:
     """Result of one search; G is the largest number of generations (or steps) that the config allows.
 
     Attributes:
-      view: the best View.
-      score: f32[], score of `view`.
+      view: the View with the best score.
+      score: f32[], score of `view`: its similarity to the target.
       best_scores: f32[G], best score after each generation. After the end of the search the last value repeats.
       evaluations: i32[], number of images until the threshold was met; the number of all images if it was not met.
-      unreachable: i32[], number of these views that the arm could not reach.
+      unreachable: i32[], number of these images' views that the arm could not reach.
       end: PolicyEnd if the searcher is a policy, otherwise None.
     """
 

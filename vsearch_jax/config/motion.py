@@ -52,7 +52,7 @@ class IKConfig:
 
     @property
     def rotation_tolerance(self) -> float:
-        """`rotation_tolerance_deg` in rad."""
+        """Largest rotation error of an IK solution, in rad. The field `rotation_tolerance_deg` gives it in degrees."""
         return math.radians(self.rotation_tolerance_deg)
 
 

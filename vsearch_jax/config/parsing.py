@@ -15,13 +15,13 @@ Parsed = TypeVar("Parsed", bound="DataclassInstance")
 
 
 def parse_dataclass(cls: type[Parsed], values: Mapping[str, object]) -> Parsed:
-    """Builds a dataclass from plain values.
+    """Builds a dataclass from nested plain values, for instance from JSON.
 
     A list becomes a tuple. A mapping becomes the dataclass that the field's type names.
 
     Args:
-      cls: the dataclass.
-      values: value of each field.
+      cls: the dataclass to build.
+      values: value of each field, by the field's name.
 
     Raises:
       ConfigError: a field is unknown or missing, or its value has another type or is out of range.

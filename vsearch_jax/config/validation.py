@@ -10,7 +10,7 @@ class ConfigError(ValueError):
 
 
 def require(owner: object, name: str, is_valid: bool, allowed: str) -> None:
-    """Checks one field.
+    """Raises a ConfigError that names the field, its value and the allowed values, unless the value is allowed.
 
     Args:
       owner: the dataclass that holds the field.
@@ -27,7 +27,7 @@ def require(owner: object, name: str, is_valid: bool, allowed: str) -> None:
 
 
 def require_positive(owner: object, *names: str) -> None:
-    """Checks that fields are greater than 0 and finite.
+    """Checks that the named fields of a dataclass are greater than 0 and finite.
 
     Args:
       owner: the dataclass that holds the fields.
@@ -41,7 +41,7 @@ def require_positive(owner: object, *names: str) -> None:
 
 
 def require_finite(owner: object, *names: str) -> None:
-    """Checks that fields are finite numbers.
+    """Checks that the named fields of a dataclass are finite numbers.
 
     Args:
       owner: the dataclass that holds the fields.
@@ -55,7 +55,7 @@ def require_finite(owner: object, *names: str) -> None:
 
 
 def require_unit(owner: object, *names: str) -> None:
-    """Checks that fields lie between 0 and 1, both included.
+    """Checks that the named fields of a dataclass lie between 0 and 1, both included.
 
     Args:
       owner: the dataclass that holds the fields.

@@ -42,22 +42,25 @@ class Config:
 
     @property
     def num_policy_iterations(self) -> int:
-        """Number of policy iterations. Each one steps every environment once."""
+        """Number of iterations of a run that train the policy. In each, every training environment makes one step."""
         return self.sac.num_environment_steps // self.sac.num_envs
 
     @property
     def num_iterations(self) -> int:
-        """Number of iterations of the run: encoder updates, then policy iterations."""
+        """Number of iterations of a run: first the updates of the encoder, then those that train the policy."""
         return self.encoder.num_updates + self.num_policy_iterations
 
     @property
     def chunk_length(self) -> int:
-        """Number of iterations in a chunk, the last one excepted."""
+        """Number of iterations that one call of `train` does (a chunk). The last chunk of a run may be shorter."""
         return -(-self.num_iterations // self.num_chunks)
 
     @staticmethod
     def preset(name: str) -> Config:
-        """Returns the preset `name`: smoke, cpu, thesis or gpu.
+        """Returns a ready-made configuration.
+
+        Args:
+          name: smoke (small, for tests), cpu, thesis or gpu.
 
         Raises:
           ConfigError: no preset has that name.
@@ -67,12 +70,15 @@ class Config:
         return PRESETS[name]
 
     def to_dict(self) -> dict[str, object]:
-        """Returns the config as nested plain values, which `json.dumps` accepts."""
+        """Returns the configuration as nested plain values, which `json.dumps` accepts."""
         return dataclasses.asdict(self)
 
     @staticmethod
     def from_dict(values: Mapping[str, object]) -> Config:
-        """Returns the config that `to_dict` turned into `values`.
+        """Builds a configuration from nested plain values. It is the inverse of `to_dict`.
+
+        Args:
+          values: value of each field, as `to_dict` returns them.
 
         Raises:
           ConfigError: a field is unknown or missing, or its value has another type or is out of range.

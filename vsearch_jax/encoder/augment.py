@@ -28,15 +28,16 @@ _DEPTH_NOISE, _HOLE_FRACTION, _NOISE_GRID = 0.02, 0.02, 32
 
 
 def randomize_lights(key: Array, scene: RenderScene, center: Array) -> RenderScene:
-    """Returns the scene with random lights and a random headlight.
+    """Returns a copy of the scene with random lights and a random headlight.
 
-    Each light gets a new position and new diffuse, specular and ambient colours. It keeps its distance from `center`
-    and shines at it. Its direction is uniform over the cap within 60 degrees of the vertical.
+    Each light gets a new position and new diffuse, specular and ambient colours. The light keeps its distance from
+    `center` and shines at `center`. Seen from `center`, the light's direction is uniform within 60 degrees of the
+    vertical.
 
     Args:
       key: PRNG key.
-      scene: RenderScene.
-      center: f32[3] m in world, centre of the view sphere.
+      scene: the scene to render.
+      center: f32[3] m in world, centre of the view sphere, where the object is.
     """
     height_key, azimuth_key, diffuse_key, tint_key, specular_key, ambient_key, headlight_key = jax.random.split(key, 7)
     lights = scene.lights
@@ -67,11 +68,11 @@ def randomize_lights(key: Array, scene: RenderScene, center: Array) -> RenderSce
 def jitter_camera(key: Array, camera: Camera) -> Camera:
     """Returns the camera with a random tilt and zoom: the image shifts by up to 5 % and scales by up to 8 %.
 
-    This costs no time. To resample the rendered image takes longer than all other operations on it together.
+    This costs no time. Resampling the rendered image would take longer than all other image operations together.
 
     Args:
       key: PRNG key.
-      camera: the Camera; its position does not change.
+      camera: the camera in world; the position does not change.
     """
     tilt_key, scale_key = jax.random.split(key)
     tilt = jax.random.uniform(tilt_key, (2,), minval=-_MAX_SHIFT, maxval=_MAX_SHIFT) * camera.fovy
@@ -81,19 +82,19 @@ def jitter_camera(key: Array, camera: Camera) -> Camera:
 
 
 def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Array:
-    """Adds random disturbances to the encoder's input. The encoder must learn to ignore them.
+    """Adds random disturbances to the encoder's input image. The encoder must learn to ignore them.
 
     Each kind of input gets occlusions. rgb and depth get a random background with probability 1/2. Then rgb gets random
     hue, saturation, contrast and brightness; depth gets noise and holes; a silhouette gets inverted spots.
 
     Args:
       key: PRNG key.
-      x: f32[H, W, C] in [0, 1], from `network_input`.
+      x: input image f32[H, W, C] in [0, 1] of H x W pixels and C channels, from `network_input`.
       is_object: bool[H, W], true on the object.
-      config: the run's config.
+      config: the run's config; `encoder.input` is the kind of the input.
 
     Returns:
-      f32[H, W, C] in [0, 1].
+      Disturbed image, f32[H, W, C] in [0, 1].
     """
     background_key, occlusion_key, sensor_key = jax.random.split(key, 3)
     if config.encoder.input == "silhouette":
@@ -104,10 +105,10 @@ def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Arr
 
 
 def clean_target(x: Array, is_object: Array, config: Config) -> Array:
-    """Returns the target of the decoder: the input with everything but the object black, or far for depth.
+    """Returns the image that the decoder must reproduce: only the object. All else is black, or far for depth.
 
     Args:
-      x: f32[h, w, C] in [0, 1], from `network_input`.
+      x: image f32[h, w, C] in [0, 1] of h x w pixels and C channels, from `network_input`.
       is_object: bool[h, w], true on the object.
       config: the run's config.
     """
@@ -116,11 +117,11 @@ def clean_target(x: Array, is_object: Array, config: Config) -> Array:
 
 
 def replace_background(key: Array, x: Array, is_object: Array) -> Array:
-    """Returns the input, with probability 1/2 with a random texture behind the object.
+    """Puts a random texture behind the object with probability 1/2, and returns the image.
 
     Args:
       key: PRNG key.
-      x: f32[H, W, C] in [0, 1].
+      x: image f32[H, W, C] in [0, 1] of H x W pixels and C channels.
       is_object: bool[H, W], true on the object.
     """
     choice_key, texture_key = jax.random.split(key)
@@ -129,11 +130,11 @@ def replace_background(key: Array, x: Array, is_object: Array) -> Array:
 
 
 def occlude(key: Array, x: Array) -> Array:
-    """Returns the input with up to two rectangles of random position, size and colour.
+    """Covers parts of an image with up to two rectangles of random position, size and colour.
 
     Args:
       key: PRNG key.
-      x: f32[H, W, C] in [0, 1].
+      x: image f32[H, W, C] in [0, 1] of H x W pixels and C channels.
     """
     height, width, features = x.shape
     numbers = jax.random.uniform(key, (_NUM_OCCLUSIONS, 5 + features))

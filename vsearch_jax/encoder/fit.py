@@ -21,7 +21,7 @@ _EIGENVALUE_FLOOR = 1e-2
 
 
 def init(key: Array, config: Config) -> EncoderState:
-    """Returns an untrained autoencoder. Its latent mean is zero and its whitening is the identity.
+    """Returns an untrained autoencoder with random parameters. Latent mean is zero, and whitening is the identity.
 
     Args:
       key: PRNG key of the parameters.
@@ -33,12 +33,12 @@ def init(key: Array, config: Config) -> EncoderState:
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Returns Adam with a cosine decay of the learning rate to zero over `num_updates`."""
+    """Returns the encoder's optimizer: Adam. Its learning rate falls to zero as a cosine over `encoder.num_updates`."""
     return optax.adam(optax.cosine_decay_schedule(config.encoder.learning_rate, config.encoder.num_updates))
 
 
 def bootstrapped_mean(errors: Array, fraction: float) -> Array:
-    """Computes the mean of the largest errors.
+    """Computes the mean of the largest errors: those that make up the given fraction of all N errors.
 
     This mean is the minimum over t of t + mean(max(errors - t, 0)) / fraction, the conditional value at risk
     (Rockafellar and Uryasev 2000). Bisection finds t. It is 15 times faster than `top_k` on CPU. The gradient ignores
@@ -49,7 +49,7 @@ def bootstrapped_mean(errors: Array, fraction: float) -> Array:
       fraction: part of the errors to average, in (0, 1].
 
     Returns:
-      f32[].
+      Mean of the largest `fraction` of the errors, f32[].
     """
     fixed = jax.lax.stop_gradient(errors)
     low, high = jnp.zeros(()), jnp.max(fixed)
@@ -62,16 +62,16 @@ def bootstrapped_mean(errors: Array, fraction: float) -> Array:
 
 
 def reconstruction_loss(params: ParamTree, x: Array, target: Array, config: Config) -> Array:
-    """Computes the bootstrapped L2 loss of one view.
+    """Computes the autoencoder's loss on one view: the mean of the largest squared errors of the decoded image.
 
     Args:
       params: parameters of encoder and decoder.
-      x: f32[H, W, C], augmented input.
-      target: f32[h, w, C], clean image; h and w are `decoder_size`.
+      x: f32[H, W, C], augmented input image with C channels.
+      target: f32[h, w, C], clean image that the decoder must reproduce; h and w are `decoder_size`.
       config: the run's config.
 
     Returns:
-      f32[].
+      Loss, f32[].
     """
     latent = network.raw_latent(params, x, config)
     errors = jnp.mean((network.reconstruct(params, latent, config) - target) ** 2, axis=-1)
@@ -79,16 +79,16 @@ def reconstruction_loss(params: ParamTree, x: Array, target: Array, config: Conf
 
 
 def update(encoder: EncoderState, inputs: Array, targets: Array, config: Config) -> tuple[EncoderState, Array]:
-    """Does one step of Adam on a batch.
+    """Trains encoder and decoder by one step of Adam on a batch of B views.
 
     Args:
-      encoder: EncoderState; mean and whitening do not change.
-      inputs: f32[B, H, W, C], augmented views.
+      encoder: state before the step. Latent mean and whitening do not change.
+      inputs: f32[B, H, W, C], augmented input images with C channels.
       targets: f32[B, h, w, C], clean images of the same views; h and w are `decoder_size`.
       config: the run's config.
 
     Returns:
-      The new EncoderState, and the mean loss f32[] before the step.
+      The state after the step, and the mean loss f32[] of the batch before the step.
     """
 
     def batch_loss(params: ParamTree) -> Array:
@@ -104,14 +104,14 @@ def update(encoder: EncoderState, inputs: Array, targets: Array, config: Config)
 
 
 def fit_whitening(raw: Array, power: float) -> tuple[Array, Array]:
-    """Computes mean and partial whitening of raw latents: `latent_mean` and `whitening` of EncoderState.
+    """Computes mean and partial whitening of raw latents (encoder outputs), which turn a raw latent into a code.
 
     The whitening matrix is symmetric. It has the eigenvectors of the covariance, and the eigenvalues of the covariance
     to the power -`power`. Eigenvalues below 1e-2 of the largest count as 1e-2 of it, so that noise is not amplified.
     The overall scale does not change a cosine; the scale here keeps the largest variance as it is.
 
     Args:
-      raw: f32[N, Z], raw latents of random reachable views.
+      raw: f32[N, Z], raw latents of N random reachable views, Z numbers each.
       power: 0 gives the identity, 1/2 gives unit variance in every direction.
 
     Returns:

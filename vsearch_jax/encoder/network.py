@@ -20,32 +20,33 @@ from vsearch_jax.types import EncoderState, Image, ParamTree
 
 
 def convolution_by_xla(x: Array, kernel: Array, stride: int) -> Array:
-    """Computes a strided convolution with "SAME" padding by XLA's own operation.
+    """Computes a strided convolution of one image, with "SAME" padding, by XLA's own operation.
 
     Args:
-      x: f32[H, W, C]; H and W are multiples of `stride`.
-      kernel: f32[k, k, C, K].
-      stride: s.
+      x: f32[H, W, C], image with C channels; H and W are multiples of `stride`.
+      kernel: f32[k, k, C, K] for C input and K output channels; k is the width of the kernel in pixels.
+      stride: distance s in pixels between kernel positions.
 
     Returns:
-      f32[H/s, W/s, K].
+      f32[H/s, W/s, K], image with K channels.
     """
     dimensions = ("NHWC", "HWIO", "NHWC")
     return jax.lax.conv_general_dilated(x[None], kernel, (stride, stride), "SAME", dimension_numbers=dimensions)[0]
 
 
 def convolution_by_matmul(x: Array, kernel: Array, stride: int) -> Array:
-    """Computes the convolution of `convolution_by_xla` by slices and one matmul.
+    """Computes a strided convolution of one image, with "SAME" padding, by slices and one matmul.
 
-    It is faster on CPU: XLA's own convolution runs on a single thread inside a loop, and its backward pass is slow.
+    The result is that of `convolution_by_xla`. On CPU this function is faster: XLA's own convolution runs on a single
+    thread inside a loop, and has a slow backward pass.
 
     Args:
-      x: f32[H, W, C]; H and W are multiples of `stride`.
-      kernel: f32[k, k, C, K], k >= stride.
-      stride: s.
+      x: f32[H, W, C], image with C channels; H and W are multiples of `stride`.
+      kernel: f32[k, k, C, K] for C input and K output channels; k is the width of the kernel in pixels, k >= stride.
+      stride: distance s in pixels between kernel positions.
 
     Returns:
-      f32[H/s, W/s, K].
+      f32[H/s, W/s, K], image with K channels.
     """
     size, _, in_features, out_features = kernel.shape
     height, width = x.shape[0] // stride, x.shape[1] // stride
@@ -108,7 +109,7 @@ class SubPixelUpsampling(nnx.Module):
 
 
 def in_features(config: EncoderConfig) -> int:
-    """Returns the number of input channels: 3 for rgb, 1 for depth and silhouette."""
+    """Returns the number of channels of the encoder's input image: 3 for rgb, 1 for depth and silhouette."""
     return 3 if config.input == "rgb" else 1
 
 
@@ -165,7 +166,7 @@ class Decoder(nnx.Module):
 
 
 def build(key: Array, config: Config) -> tuple[Encoder, Decoder]:
-    """Builds encoder and decoder with random parameters.
+    """Builds the two networks, encoder and decoder, as flax.nnx modules with random parameters.
 
     Args:
       key: PRNG key of the parameters.
@@ -184,7 +185,7 @@ def _graphs(config: Config) -> tuple[nnx.GraphDef[Encoder], nnx.GraphDef[Decoder
 
 
 def init_params(key: Array, config: Config) -> ParamTree:
-    """Returns random parameters under the names `encoder` and `decoder`.
+    """Returns random parameters of the autoencoder as a dictionary with the keys `encoder` and `decoder`.
 
     Args:
       key: PRNG key of the parameters.
@@ -198,77 +199,77 @@ def init_params(key: Array, config: Config) -> ParamTree:
 
 
 def raw_latent(params: ParamTree, x: Array, config: Config) -> Array:
-    """Computes the raw latent of an input.
+    """Encodes an input image: computes its raw latent, the encoder's output vector before any normalisation.
 
     Args:
       params: parameters of encoder and decoder.
-      x: f32[H, W, C] in [0, 1], from `network_input`.
+      x: image f32[H, W, C] in [0, 1] with C channels, from `network_input`.
       config: the run's config.
 
     Returns:
-      f32[Z].
+      Raw latent, f32[Z]; Z is `config.encoder.code_size`.
     """
     return nnx.merge(_graphs(config)[0], params["encoder"])(x)
 
 
 def reconstruct(params: ParamTree, latent: Array, config: Config) -> Array:
-    """Decodes a raw latent to the clean image.
+    """Decodes a raw latent (encoder output): returns the decoder's image, which shows the object without disturbances.
 
     Args:
       params: parameters of encoder and decoder.
-      latent: f32[Z], raw latent.
+      latent: f32[Z], raw latent of Z numbers.
       config: the run's config.
 
     Returns:
-      f32[decoder_size, decoder_size, C] in [0, 1].
+      Image f32[decoder_size, decoder_size, C] in [0, 1] with C channels.
     """
     return nnx.merge(_graphs(config)[1], params["decoder"])(latent)
 
 
 def code_of(encoder: EncoderState, raw: Array) -> Array:
-    """Computes the code of a raw latent. Searchers compare codes, and the policy reads them.
+    """Normalises a raw latent (encoder output) to a code. Searchers compare codes, and the policy reads them.
 
-    The code is the raw latent minus its mean, partially whitened, and scaled to mean square 1 (norm sqrt(Z)).
+    The code is the raw latent minus the mean latent, partially whitened, and scaled to mean square 1 (norm sqrt(Z)).
     An all-zero code stays zero, and its gradients are finite.
 
     Args:
-      encoder: EncoderState with mean and whitening.
-      raw: f32[Z], raw latent.
+      encoder: state that holds the mean latent and the whitening matrix.
+      raw: f32[Z], raw latent of Z numbers.
 
     Returns:
-      f32[Z].
+      Code, f32[Z].
     """
     code = encoder.whitening @ (raw - encoder.latent_mean)
     return code * jax.lax.rsqrt(jnp.maximum(jnp.mean(code**2), 1e-12))
 
 
 def encode(encoder: EncoderState, x: Array, config: Config) -> Array:
-    """Computes the code of an input; see `code_of`.
+    """Computes the code of an input image. The code is the encoder's output, normalised by `code_of`.
 
     Args:
-      encoder: EncoderState.
-      x: f32[H, W, C] in [0, 1], from `network_input`.
+      encoder: the trained autoencoder.
+      x: image f32[H, W, C] in [0, 1] with C channels, from `network_input`.
       config: the run's config.
 
     Returns:
-      f32[Z].
+      Code, f32[Z] of Z numbers.
     """
     return code_of(encoder, raw_latent(encoder.params, x, config))
 
 
 def network_input(image: Image, object_geom_ids: Array | tuple[int, ...], config: Config) -> Array:
-    """Converts an image to the encoder's input. `config.encoder.input` is its kind.
+    """Converts a rendered image to the encoder's input image. `config.encoder.input` says of which kind.
 
     rgb: the image's colours. silhouette: 1 on the object, 0 elsewhere. depth: d / radius - 1/2, clipped to [0, 1], so
     the range is half a radius of the view sphere before and behind its centre. A miss is 1.
 
     Args:
-      image: Image of H x W pixels.
-      object_geom_ids: i32[G], MuJoCo's geom numbers of the object.
+      image: rendered image of H x W pixels.
+      object_geom_ids: i32[G], MuJoCo's numbers of the G geoms of the object.
       config: the run's config.
 
     Returns:
-      f32[H, W, C] in [0, 1].
+      Input image f32[H, W, C] in [0, 1]; C is 3 for rgb, else 1.
     """
     if config.encoder.input == "rgb":
         return image.rgb

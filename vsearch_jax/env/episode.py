@@ -34,11 +34,13 @@ class UnreachableError(ConfigError):
 
 
 def check_band(reach: ReachabilityMap, config: Config) -> None:
-    """Checks that there is a band to search. Does nothing while JAX traces, because values are unknown then.
+    """Checks that there is a band to search: elevations that the arm reaches at every azimuth.
+
+    Does nothing while JAX traces, because values are unknown then.
 
     Args:
-      reach: ReachabilityMap of the arm.
-      config: the run's config; the message names its arm, mount height and object.
+      reach: the views that the arm reaches.
+      config: the run's config. The error names the arm, mount height and object of this config.
 
     Raises:
       UnreachableError: there is no elevation that the arm reaches at every azimuth.
@@ -53,28 +55,28 @@ def check_band(reach: ReachabilityMap, config: Config) -> None:
 
 
 def episode_of(state: State) -> EpisodeState:
-    """Returns the EpisodeState in a brax State."""
+    """Returns what a brax State stores of the episode: present observation, target observation and step count."""
     # brax declares its own physics state here, but never reads it and accepts any pytree.
     return cast(EpisodeState, state.pipeline_state)
 
 
 def obs_of(state: State) -> Array:
-    """Returns the policy's flat input vector f32[D] in a brax State of this task."""
+    """Returns the policy's flat input vector f32[D] that a brax State of this task stores; D is its length."""
     # brax also allows a mapping of arrays; this task never makes one.
     return cast(Array, state.obs)
 
 
 def build_obs(episode: EpisodeState) -> Array:
-    """Returns the policy's flat input vector f32[D]: code, target code, joint values."""
+    """Builds the policy's flat input vector of D numbers, f32[D]: image code, target's image code, joint values."""
     return jnp.concatenate([episode.observation.code, episode.target.code, episode.observation.qpos])
 
 
 def start_state(observation: Observation, target: Observation) -> State:
-    """Returns the brax State at the start of an episode.
+    """Builds the brax State at the start of an episode.
 
     Args:
-      observation: Observation from the initial view.
-      target: Observation from the target view.
+      observation: what the wrist camera sees from the initial view.
+      target: what the wrist camera sees from the target view.
     """
     episode = EpisodeState(observation=observation, target=target, num_steps=jnp.zeros((), jnp.int32))
     zero = jnp.zeros(())
@@ -92,12 +94,13 @@ def start_state(observation: Observation, target: Observation) -> State:
 
 
 def next_state(state: State, observation: Observation, motion: Motion, config: EnvConfig) -> State:
-    """Returns the brax State after one step: observation, reward, termination and metrics.
+    """Builds the brax State after one step from the new observation: reward, termination and metrics.
 
     Args:
       state: brax State before the step.
-      observation: Observation from the commanded view; ignored if `motion` is not found, because the arm stays then.
-      motion: the Motion to that view.
+      observation: what the wrist camera sees from the commanded view. If `motion` is not found, the arm stays and
+        `observation` is ignored.
+      motion: cost of the arm's motion to that view, and whether a motion was found.
       config: threshold, rewards and episode length.
     """
     episode = episode_of(state)
@@ -128,11 +131,11 @@ def next_state(state: State, observation: Observation, motion: Motion, config: E
 
 
 def commanded_view(view: View, action: Array, action_scale_deg: float) -> View:
-    """Returns the View to which an action leads, reachable or not.
+    """Returns the view that an action asks for: the present view plus the action's change. It may be unreachable.
 
     Args:
-      view: the present View, f32[] rad.
-      action: f32[2], change of azimuth and elevation; clipped to [-1, 1].
+      view: the present view (azimuth and elevation), f32[] rad each.
+      action: f32[2], change of azimuth and elevation in units of `action_scale_deg`; clipped to [-1, 1].
       action_scale_deg: change in degrees for an action of 1.
     """
     delta = jnp.clip(action, -1.0, 1.0) * math.radians(action_scale_deg)
@@ -140,14 +143,15 @@ def commanded_view(view: View, action: Array, action_scale_deg: float) -> View:
 
 
 def pose_error(camera: Camera, target: Camera) -> tuple[Array, Array, Array]:
-    """Computes how far a camera is from the target camera.
+    """Computes the rotation and translation errors of a camera pose with respect to a target camera pose.
 
     Args:
-      camera: the Camera; its arrays may have leading batch axes.
-      target: the target Camera.
+      camera: the camera in world; its arrays may have leading batch axes.
+      target: the camera in world at the target view.
 
     Returns:
-      Rotation error in rad (geodesic), rotation error in rad by formula 3.2 of the thesis, translation error in m.
+      Three f32 arrays with the batch axes: the geodesic rotation error in rad, the rotation error in rad by formula 3.2
+      of the thesis, and the translation error in m.
     """
     translation = jnp.sqrt(jnp.sum((camera.position - target.position) ** 2, axis=-1))
     rotations = (camera.rotation, target.rotation)

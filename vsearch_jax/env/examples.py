@@ -14,17 +14,17 @@ from vsearch_jax.env.task import ViewSearchEnv
 
 
 def encoder_example(key: Array, *, env: ViewSearchEnv) -> tuple[Array, Array]:
-    """Renders one random view twice: as the encoder's augmented input and as its clean target.
+    """Renders one training example of the encoder: a random view as augmented input and as clean target image.
 
-    The arm has a random configuration. The target has no shadows, so the encoder learns to ignore the arm's shadow.
+    The arm has random joint values. The target has no shadows, so the encoder learns to ignore the arm's shadow.
 
     Args:
-      key: PRNG key of view, configuration, lights, camera jitter and image augmentation.
-      env: the task; its encoder is not used.
+      key: PRNG key of view, joint values, lights, camera jitter and image augmentation.
+      env: the task. Scene and arm are used, the encoder in it is not.
 
     Returns:
-      Input f32[H, W, C] in [0, 1], `scene.image_size` high and wide, and target f32[h, w, C] in [0, 1],
-      `encoder.decoder_size` high and wide.
+      Input image f32[H, W, C] in [0, 1], `scene.image_size` high and wide, and target image f32[h, w, C] in [0, 1],
+      `encoder.decoder_size` high and wide. C is the number of channels.
     """
     pose_key, light_key, camera_key, image_key = jax.random.split(key, 4)
     _, qpos = env.random_pose(pose_key)

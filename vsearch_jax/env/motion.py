@@ -26,14 +26,14 @@ _PLANNING_SEED = 20_191_202
 
 
 def joints_from_uniform(arm: Arm, numbers: Array) -> Array:
-    """Maps uniform numbers to joint values inside the limits.
+    """Maps random numbers from [0, 1) to random joint values inside the joint limits.
 
     Args:
       arm: the arm.
-      numbers: f32[nq] in [0, 1).
+      numbers: f32[nq] in [0, 1), one number for each joint value.
 
     Returns:
-      f32[nq] rad or m. Only the joints that move the camera vary; the other joints are at home.
+      Joint values f32[nq] rad or m. Only the joints that move the camera vary. The other joints have their home values.
     """
     lower, upper = start_limits(arm)
     address = arm.chain.address
@@ -42,29 +42,34 @@ def joints_from_uniform(arm: Arm, numbers: Array) -> Array:
 
 
 def straight_motion(arm: Arm, qpos: Array, goal: Array, config: PlanningConfig) -> Motion:
-    """Returns the straight motion between two configurations. Obstacles are ignored.
+    """Returns the cost of a straight motion between two configurations (joint values). Obstacles are ignored.
 
     Args:
       arm: the arm.
-      qpos: f32[nq] rad or m, start.
-      goal: f32[nq] rad or m.
-      config: acceleration time.
+      qpos: f32[nq] rad or m, joint values at the start.
+      goal: f32[nq] rad or m, joint values at the end.
+      config: settings of timing; the acceleration time is read.
+
+    Returns:
+      Length and duration of the motion; it is always found.
     """
     travel = jnp.linalg.norm((goal - qpos)[arm.chain.address])
     return Motion(jnp.bool_(True), travel, straight_duration(arm, qpos, goal, config))
 
 
 def plan_motion(arm: Arm, qpos: Array, goal: Array, config: PlanningConfig) -> tuple[Trajectory, Motion]:
-    """Plans a timed motion between two configurations. Equal arguments give equal motions.
+    """Plans a path without contact between two configurations (joint values), and times the motion along it.
+
+    Equal arguments give equal motions.
 
     Args:
       arm: the arm.
-      qpos: f32[nq] rad or m, start.
-      goal: f32[nq] rad or m.
+      qpos: f32[nq] rad or m, joint values at the start.
+      goal: f32[nq] rad or m, joint values at the end.
       config: settings of path planning and timing.
 
     Returns:
-      The Trajectory and its Motion (costs). If no path is found, the Trajectory stays at the start.
+      The timed motion, and its cost. If no path is found, the arm stays at the start, and the cost says so.
 
     Raises:
       PlanningError: the model gives no speed limit for a joint.
@@ -75,18 +80,18 @@ def plan_motion(arm: Arm, qpos: Array, goal: Array, config: PlanningConfig) -> t
 
 
 def move_joints(scene: Scene, arm: Arm, qpos: Array, goal: Array, config: Config) -> tuple[Array, Motion]:
-    """Plans a motion and moves the arm along it, as `config.env.motion` says.
+    """Plans a path without contact to a goal, and moves the arm along it, kinematically or by the arm's dynamics.
 
     Args:
-      scene: the Scene; its MJX model is used for dynamic motion.
+      scene: the scene. The MJX model in it is used for dynamic motion.
       arm: the arm.
-      qpos: f32[nq] rad or m, start.
-      goal: f32[nq] rad or m.
-      config: the run's config.
+      qpos: f32[nq] rad or m, joint values at the start.
+      goal: f32[nq] rad or m, joint values to reach.
+      config: the run's config; `env.motion` chooses kinematic or dynamic motion.
 
     Returns:
-      f32[nq] rad or m, configuration at the end, and the planned Motion. If no path is found, the arm stays.
-      Kinematic motion ends at the goal. Dynamic motion follows the path and ends near the goal.
+      Joint values after the motion, f32[nq] rad or m, and the cost of the planned motion. Kinematic motion ends at the
+      goal. Dynamic motion follows the path and ends near the goal. If no path is found, the arm stays.
     """
     is_kinematic = config.env.motion == "kinematic"
     if arm.joints_without_speed and is_kinematic:

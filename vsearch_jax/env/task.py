@@ -74,23 +74,23 @@ class ViewSearchEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Size of `obs` (brax's name)."""
+        """Length of the policy's input vector `obs` (brax's name)."""
         return 2 * self.config.encoder.code_size + self.scene.mj_model.nq
 
     @property
     def action_size(self) -> int:
-        """Size of an action."""
+        """Number of entries of an action: change of azimuth and change of elevation (brax's name)."""
         return 2
 
     @property
     def backend(self) -> str:
-        """Name of the physics backend, as brax asks for it."""
+        """Name of the physics backend, "mjx"; brax requires this property."""
         return "mjx"
 
     # -- episode ------------------------------------------------------------------------------------------------------
 
     def reset(self, rng: Array) -> State:
-        """Returns the start of an episode. Initial view and target view are random over the reachable band.
+        """Starts an episode: returns its brax State. Initial and target view are random reachable views.
 
         Args:
           rng: PRNG key (brax's name for it).
@@ -100,20 +100,20 @@ class ViewSearchEnv(Env):
         return self.start(initial, target)
 
     def start(self, observation: Observation, target: Observation) -> State:
-        """Returns the start of an episode with given views.
+        """Starts an episode with given observations: returns its brax State.
 
         Args:
-          observation: Observation from the initial view.
-          target: Observation from the target view.
+          observation: what the wrist camera sees from the initial view.
+          target: what the wrist camera sees from the target view.
         """
         return start_state(observation, target)
 
     def step(self, state: State, action: Array) -> State:
-        """Returns the brax State after an action. After the end of the episode (`done`) nothing changes.
+        """Moves the camera by an action, and returns the brax State after it. If `done` is set, nothing changes.
 
         Args:
-          state: brax State.
-          action: f32[2], clipped to [-1, 1].
+          state: brax State before the action.
+          action: f32[2], change of azimuth and elevation in units of `env.action_scale_deg`; clipped to [-1, 1].
         """
         is_over = state.done > 0.0
         observation, motion = self.move_to_view(
@@ -122,39 +122,39 @@ class ViewSearchEnv(Env):
         return tree_where(is_over, state, self.apply_transition(state, observation, motion))
 
     def commanded_view(self, state: State, action: Array) -> View:
-        """Returns the View to which an action leads, reachable or not.
+        """Returns the view that an action asks for: the present view plus the action's change. It may be unreachable.
 
         Args:
-          state: brax State.
-          action: f32[2], clipped to [-1, 1].
+          state: brax State before the action.
+          action: f32[2], change of azimuth and elevation in units of `env.action_scale_deg`; clipped to [-1, 1].
         """
         return commanded_view(episode_of(state).observation.view, action, self.config.env.action_scale_deg)
 
     def apply_transition(self, state: State, observation: Observation, motion: Motion) -> State:
-        """Returns the brax State after one step.
+        """Builds the brax State after one step from its observation: reward, `done`, metrics.
 
         Args:
           state: brax State before the step.
-          observation: Observation from the commanded view; ignored if `motion` is not found.
-          motion: the Motion to that view. If it is not found, the arm stays.
+          observation: what the wrist camera sees from the commanded view; ignored if `motion` is not found.
+          motion: cost of the motion to that view, and whether it was found. If not, the arm stays.
         """
         return next_state(state, observation, motion, self.config.env)
 
     # -- views and configurations -------------------------------------------------------------------------------------
 
     def compute_reachability(self, key: Array) -> ReachabilityMap:
-        """Returns the ReachabilityMap of the config's arm, mount and object; `key` draws the starts of IK."""
+        """Computes which views the arm reaches, on a grid of views; the PRNG key `key` draws the starts of IK."""
         return reachability_map(self.arm, self.center, self.scene.radius, self.config.ik, key)
 
     def solve_joints(self, view: View, qpos: Array) -> tuple[Array, Array]:
-        """Solves IK for a view.
+        """Solves IK for a view: returns joint values that bring the wrist camera there.
 
         Args:
-          view: View, f32[] rad.
+          view: View to reach, f32[] rad.
           qpos: f32[nq] rad or m, preferred joint values; IK returns the nearest solution that it finds.
 
         Returns:
-          Joint values f32[nq] rad or m, and bool[] whether the arm reaches the view.
+          Joint values f32[nq] rad or m; and bool[], whether they reach the view inside the limits and without contact.
         """
         result, is_reachable = solve_view(
             self.arm, self.reach, view, qpos, (self.center, self.scene.radius), self.config.ik
@@ -162,25 +162,25 @@ class ViewSearchEnv(Env):
         return result.qpos, is_reachable
 
     def random_pose(self, key: Array) -> tuple[View, Array]:
-        """Returns a random reachable View and joint values f32[nq] rad or m for it.
+        """Draws a random view that the arm reaches, and joint values f32[nq] rad or m that reach it.
 
-        The view is uniform in azimuth and elevation over the band. The joint values are the IK solution nearest to a
-        random configuration. If IK fails, the view of the nearest reachable cell of the map is returned.
+        The view is uniform over the band (elevations reachable at every azimuth). The joint values are the IK solution
+        nearest to random ones. If IK fails, the nearest reachable view of the reachability map's grid is returned.
         """
         view, qpos, _ = self.resolve_view(*self.random_view(key), jnp.bool_(False))
         return view, qpos
 
     def resolve_view(self, view: View, qpos: Array, is_fixed: Array) -> tuple[View, Array, Array]:
-        """Returns a view that the arm reaches: `view` itself, or the nearest reachable cell of the map.
+        """Returns a view that the arm reaches: `view` itself, or the nearest reachable view of the map's grid.
 
         Args:
-          view: View, f32[] rad.
+          view: wanted View, f32[] rad.
           qpos: f32[nq] rad or m, preferred joint values; IK returns the nearest solution that it finds.
-          is_fixed: bool[], `view` must not be replaced by a cell of the map.
+          is_fixed: bool[], `view` must not be replaced by another view.
 
         Returns:
-          The View, joint values f32[nq] rad or m, and bool[] whether these reach the View. It is false only if
-          `view` is fixed and unreachable.
+          The View; joint values f32[nq] rad or m; and bool[], whether the joint values reach the View. This is false
+          only if `view` is fixed and unreachable.
         """
         joints, is_reachable = self.solve_joints(view, qpos)
         is_kept = is_reachable | is_fixed
@@ -190,7 +190,7 @@ class ViewSearchEnv(Env):
         return view, joints, is_reachable | ~is_fixed
 
     def random_view(self, key: Array) -> tuple[View, Array]:
-        """Returns a View, uniform over the band, and a random configuration f32[nq] rad or m."""
+        """Draws a view, uniform over the reachable band, and joint values f32[nq] rad or m, unrelated to the view."""
         # One draw for all numbers, because each draw adds much compile time.
         numbers = jax.random.uniform(key, (2 + self.scene.mj_model.nq,))
         low, high = self.reach.band
@@ -198,31 +198,31 @@ class ViewSearchEnv(Env):
         return view, motions.joints_from_uniform(self.arm, numbers[2:])
 
     def random_joints(self, key: Array) -> Array:
-        """Returns a random configuration f32[nq] rad or m.
+        """Draws random joint values f32[nq] rad or m.
 
-        The joints that move the camera are uniform inside their limits. The other joints are at home.
+        The joints that move the camera are uniform inside their limits. The other joints have their home values.
         """
         return motions.joints_from_uniform(self.arm, jax.random.uniform(key, (self.scene.mj_model.nq,)))
 
     def random_observation(self, key: Array) -> Observation:
-        """Returns the Observation from a random reachable view."""
+        """Draws a random view that the arm reaches, and returns what the wrist camera sees from there."""
         view, qpos = self.random_pose(key)
         return self.observe_view(view, qpos)
 
     # -- motions ------------------------------------------------------------------------------------------------------
 
     def move_to_view(self, view: View, qpos: Array, is_over: Array | None = None) -> tuple[Observation, Motion]:
-        """Moves the arm to a view.
+        """Moves the arm to a view, and returns what the wrist camera sees there and what the motion cost.
 
         Args:
-          view: View, f32[] rad.
+          view: View to reach, f32[] rad.
           qpos: f32[nq] rad or m, present joint values.
-          is_over: bool[], the search has ended. Then the arm stays, because a motion costs much time, and the result
-            has no meaning.
+          is_over: bool[], the search has ended. Then the arm stays, which saves computing time, and the result has no
+            meaning.
 
         Returns:
-          The Observation after the motion, and the Motion. If the view is unreachable, the arm stays and the Motion is
-          not found.
+          The observation after the motion, and the cost of the motion. If the view is unreachable, the arm stays and
+          `is_found` of the cost is false.
         """
         joints, is_reachable = self.solve_joints(view, qpos)
         joints = jnp.where(is_reachable if is_over is None else is_reachable & ~is_over, joints, qpos)
@@ -233,31 +233,31 @@ class ViewSearchEnv(Env):
         return self.observe_view(view, joints), Motion(is_found, *costs)
 
     def straight_motion(self, qpos: Array, goal: Array) -> Motion:
-        """Returns the straight motion between two configurations. Obstacles are ignored.
+        """Returns the cost of a straight motion between two joint vectors. Obstacles are ignored.
 
         Args:
-          qpos: f32[nq] rad or m, start.
-          goal: f32[nq] rad or m.
+          qpos: f32[nq] rad or m, joint values at the start.
+          goal: f32[nq] rad or m, joint values at the end.
         """
         return motions.straight_motion(self.arm, qpos, goal, self.config.planning)
 
     def move_joints(self, qpos: Array, goal: Array) -> tuple[Array, Motion]:
-        """Moves the arm along a planned path. Returns the configuration f32[nq] at the end, and the planned Motion.
+        """Moves the arm along a planned path. Returns joint values f32[nq] after the motion, and the motion's cost.
 
-        If no path is found, the arm stays. Kinematic motion ends at the goal, dynamic motion near it.
+        Kinematic motion ends at the goal, dynamic motion near it. If no path is found, the arm stays.
 
         Args:
-          qpos: f32[nq] rad or m, start.
-          goal: f32[nq] rad or m.
+          qpos: f32[nq] rad or m, joint values at the start.
+          goal: f32[nq] rad or m, joint values to reach.
         """
         return motions.move_joints(self.scene, self.arm, qpos, goal, self.config)
 
     def plan_motion(self, qpos: Array, goal: Array) -> tuple[Trajectory, Motion]:
-        """Returns a timed Trajectory between two configurations, and its Motion. Equal arguments give equal results.
+        """Plans a timed motion without contact, and returns it with its cost. Equal arguments give equal results.
 
         Args:
-          qpos: f32[nq] rad or m, start.
-          goal: f32[nq] rad or m.
+          qpos: f32[nq] rad or m, joint values at the start.
+          goal: f32[nq] rad or m, joint values at the end.
 
         Raises:
           PlanningError: the model gives no speed limit for a joint.
@@ -267,32 +267,32 @@ class ViewSearchEnv(Env):
     # -- wrist camera -------------------------------------------------------------------------------------------------
 
     def observe_view(self, view: View, qpos: Array) -> Observation:
-        """Returns the Observation of the wrist camera.
+        """Returns what the wrist camera sees with the arm at `qpos`: camera pose and image code.
 
         Args:
-          view: View, f32[] rad; stored in the Observation, but it does not move the camera.
+          view: View, f32[] rad, of these joint values. It is only stored in the result.
           qpos: f32[nq] rad or m, joint values of the arm.
         """
         camera, latent = self.observe_latent(qpos)
         return Observation(view=view, qpos=qpos, camera=camera, code=encoders.code_of(self.encoder, latent))
 
     def observe_latent(self, qpos: Array) -> tuple[Camera, Array]:
-        """Returns the wrist Camera and the raw latent f32[Z] of its image, with the arm at `qpos` (f32[nq])."""
+        """Returns the wrist camera, and its image's raw latent (encoder output, f32[Z]), with the arm at `qpos`."""
         camera, image = self.wrist_image(qpos)
         return camera, self.raw_latent(image)
 
     def raw_latent(self, image: Image) -> Array:
-        """Returns the raw latent f32[Z] of an Image of the wrist camera."""
+        """Encodes an image of the wrist camera: returns its raw latent (the encoder's output of Z numbers), f32[Z]."""
         pixels = encoders.network_input(image, jnp.asarray(self.scene.object_geom_ids), self.config)
         return encoders.raw_latent(self.encoder.params, pixels, self.config)
 
     def wrist_image(self, qpos: Array) -> tuple[Camera, Image]:
-        """Returns the wrist Camera and its Image, with the arm at `qpos` (f32[nq] rad or m)."""
+        """Returns the wrist camera and the image that it takes, with the arm at `qpos` (f32[nq] rad or m)."""
         data, camera = self.forward(qpos)
         size = (self.config.scene.image_size, self.config.scene.image_size)
         return camera, render.render(self.render_scene, data, camera, size)
 
     def forward(self, qpos: Array) -> tuple[mjx.Data, Camera]:
-        """Returns MJX data and the wrist Camera, with the arm at `qpos` (f32[nq] rad or m)."""
+        """Computes forward kinematics at `qpos` (f32[nq] rad or m): returns MJX data and the wrist camera in world."""
         data = forward_kinematics(self.arm, qpos)
         return data, render.camera_from_pose(camera_pose(self.arm, data), self.fovy)

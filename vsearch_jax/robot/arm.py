@@ -20,13 +20,13 @@ from vsearch_jax.scene import Scene, SceneError
 
 @flax.struct.dataclass
 class Arm:
-    """An arm in its scene.
+    """An arm in its scene: kinematics, joint limits, and the pairs of geoms that must not touch.
 
     Attributes:
       joints: all joints of the model.
       chain: the J joints between the world and the wrist camera. Each joint hangs on the joint before it.
       wrist: f32[4, 4], pose of the wrist camera in the frame of the last joint of `chain`.
-      bodies: Placement of the bodies.
+      bodies: Placement of the bodies: to which joint frame each body is fixed, and where.
       geoms: Placement of the geoms.
       sites: Placement of the sites.
       cameras: Placement of the cameras.
@@ -38,7 +38,7 @@ class Arm:
       pairs: pairs of geoms that must not touch.
       planning_pairs: the subset of `pairs` that planning checks. Ellipsoids are replaced by enclosing capsules.
       table_height: f32[] m, world z of the table.
-      table_clearance: f32[] m, minimum distance from the table.
+      table_clearance: f32[] m, minimum distance of the arm from the table.
       data: mjx.Data, template that `forward_kinematics` fills.
       camera_id: MuJoCo's number of the wrist camera.
       joints_without_speed: names of the joints of `chain` that have no speed limit.
@@ -82,7 +82,7 @@ class Clearance:
 
 
 def build_arm(scene: Scene) -> Arm:
-    """Returns the arm of `scene`.
+    """Builds the arm of a scene: its kinematics, its joint limits, and the pairs of geoms that must not touch.
 
     Raises:
       SceneError: a joint that moves the wrist camera has no limits.
@@ -173,13 +173,13 @@ def _build_collision_pairs(scene: Scene, data: mujoco.MjData) -> tuple[collision
 
 
 def forward_kinematics(arm: Arm, qpos: Array) -> mjx.Data:
-    """Computes the poses of all bodies, geoms, sites and cameras.
+    """Computes the poses of all bodies, geoms, sites and cameras at one configuration.
 
-    The result equals C MuJoCo to 1e-5.
+    The poses equal those of C MuJoCo to 1e-5.
 
     Args:
       arm: the arm.
-      qpos: f32[nq] rad or m.
+      qpos: f32[nq] rad or m, values of all joints.
 
     Returns:
       mjx.Data with these fields set: qpos, xpos, xmat, xanchor, xaxis, geom_xpos, geom_xmat, site_xpos, site_xmat,
@@ -206,14 +206,14 @@ def forward_kinematics(arm: Arm, qpos: Array) -> mjx.Data:
 
 
 def camera_pose(arm: Arm, data: mjx.Data) -> SE3:
-    """Returns the pose of the wrist camera.
+    """Returns the pose of the wrist camera in world.
 
     Args:
       arm: the arm.
-      data: from `forward_kinematics`.
+      data: kinematics of the arm, from `forward_kinematics`.
 
     Returns:
-      T_world_camera, translation in m.
+      T_world_camera, the transform from the camera's frame to world; translation in m.
     """
     return SE3.from_rotation_and_translation(
         SO3.from_matrix(data.cam_xmat[arm.camera_id]), data.cam_xpos[arm.camera_id]
@@ -221,15 +221,16 @@ def camera_pose(arm: Arm, data: mjx.Data) -> SE3:
 
 
 def camera_kinematics(arm: Arm, joint_values: Array) -> tuple[Array, Array, Array]:
-    """Computes pose and Jacobian of the wrist camera. IK calls this function in each iteration.
+    """Computes the pose of the wrist camera and its Jacobian. IK calls this function in each iteration.
 
     Args:
       arm: the arm.
-      joint_values: f32[J] rad or m, values of the joints of `arm.chain`.
+      joint_values: f32[J] rad or m, values of the J joints that move the camera (`arm.chain`).
 
     Returns:
-      Position f32[3] m in world. Rotation f32[3, 3], camera to world. Geometric Jacobian f32[6, J] in world: three
-      linear rows (m), then three angular rows (rad) (Siciliano et al., Robotics, 3.1.3).
+      Position of the camera, f32[3] m in world. Rotation of the camera, f32[3, 3], camera to world. Geometric Jacobian
+      of the camera's pose, f32[6, J] in world: three linear rows (m), then three angular rows (rad) (Siciliano et al.,
+      Robotics, 3.1.3).
     """
     rotations, positions, axes, anchors = kinematics.frames(arm.chain, joint_values)
     rotation = kinematics.matmul(rotations[-1], arm.wrist[:3, :3])
@@ -244,15 +245,15 @@ def clearance(arm: Arm, data: mjx.Data) -> Clearance:
     """Computes how far the arm is from the table, the object, the obstacles and itself.
 
     A geom of the arm that is not a capsule counts as its enclosing capsule. A mesh counts as its bounding box. These
-    solids contain the geom, so the true distance is never smaller. Neighbouring links and excluded pairs are ignored,
-    as in MuJoCo.
+    solids contain the geom, so the true distance is never smaller than the result. As in MuJoCo, pairs of neighbouring
+    links and pairs that the model excludes are ignored.
 
     Args:
       arm: the arm.
-      data: from `forward_kinematics`.
+      data: kinematics of the arm, from `forward_kinematics`.
 
     Returns:
-      Signed distances in m.
+      Signed distances in m, the smallest for each of the four; negative in contact.
     """
     pairs = arm.pairs
     gap = collision.pair_distances(pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
@@ -265,14 +266,14 @@ def clearance(arm: Arm, data: mjx.Data) -> Clearance:
 
 
 def is_free(arm: Arm, data: mjx.Data) -> Array:
-    """Checks that no pair touches and that the table clearance is kept.
+    """Checks that the arm touches nothing and keeps the minimum distance from the table.
 
     Args:
       arm: the arm.
-      data: from `forward_kinematics`.
+      data: kinematics of the arm, from `forward_kinematics`.
 
     Returns:
-      bool[], true where the arm is free.
+      bool[], true if there is no contact and the distance from the table is above `arm.table_clearance`.
     """
     gap = collision.pair_distances(arm.pairs, data.geom_xpos, data.geom_xmat, arm.table_height)
     return jnp.all(gap > jnp.where(arm.pairs.part == collision.TABLE, arm.table_clearance, 0.0))

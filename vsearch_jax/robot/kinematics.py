@@ -22,7 +22,7 @@ from vsearch_jax.xla.batching import append_axes
 
 @flax.struct.dataclass
 class Joints:
-    """Hinges and slides; a parent comes before its children. The origin of a joint's frame lies on the joint's axis.
+    """J hinges and slides; a parent comes before its children. The origin of a joint's frame lies on the joint's axis.
 
     Attributes:
       parent: i32[J], number of the frame that the joint hangs on. 0 is the world; j + 1 is the frame of joint j.
@@ -45,11 +45,11 @@ class Joints:
 
 @flax.struct.dataclass
 class Placement:
-    """Where N bodies, geoms, sites or cameras are fixed.
+    """To which joint frames N items (bodies, geoms, sites or cameras) are fixed, and where.
 
     Attributes:
-      frame: i32[N], number of the frame, as in `Joints.parent`.
-      position: f32[N, 3] m, in the frame.
+      frame: i32[N], number of the item's frame, as in `Joints.parent`.
+      position: f32[N, 3] m, origin of the item in the frame.
       rotation: f32[N, 3, 3], item to frame.
     """
 
@@ -59,43 +59,45 @@ class Placement:
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """Returns the matrix product f32[..., 3, 3], computed as a sum. On CPU this is faster than a batched dot.
+    """Returns the products `a` `b` of 3x3 matrices, f32[..., 3, 3].
+
+    The product is computed as a sum. On CPU this is faster than a batched dot.
 
     Args:
-      a: f32[..., 3, 3].
-      b: f32[..., 3, 3].
+      a: f32[..., 3, 3], left matrices.
+      b: f32[..., 3, 3], right matrices.
     """
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
 def rotate(rotation: Array, vector: Array) -> Array:
-    """Rotates vectors whose batch axes lead.
+    """Rotates vectors by rotation matrices. The batch axes come first.
 
     Args:
-      rotation: f32[..., 3, 3].
-      vector: f32[..., 3], with as many batch axes as `rotation`.
+      rotation: f32[..., 3, 3], rotation matrices.
+      vector: f32[..., 3], the vectors, with as many batch axes as `rotation`.
 
     Returns:
-      f32[..., 3], `rotation` times `vector`.
+      The rotated vectors f32[..., 3], `rotation` times `vector`.
     """
     return jnp.sum(rotation * vector[..., None, :], axis=-1)
 
 
 def rotate_each(rotations: Array, vectors: Array) -> Array:
-    """Rotates N vectors whose batch axes come last, the layout of `frames`.
+    """Rotates N vectors, each by its own rotation matrix. The batch axes come last, as in `frames`.
 
     Args:
-      rotations: f32[N, 3, 3, ...].
-      vectors: f32[N, 3, ...].
+      rotations: f32[N, 3, 3, ...], rotation matrices.
+      vectors: f32[N, 3, ...], the vectors.
 
     Returns:
-      f32[N, 3, ...], each rotation times its vector.
+      The rotated vectors f32[N, 3, ...], each rotation times its vector.
     """
     return jnp.sum(rotations * vectors[:, None], axis=2)
 
 
 def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
-    """Computes the frames of all joints in world.
+    """Computes the frames of all joints in world at given joint values.
 
     Args:
       joints: the J joints.
@@ -103,8 +105,9 @@ def frames(joints: Joints, values: Array) -> tuple[Array, Array, Array, Array]:
         at the end, too.
 
     Returns:
-      Rotations f32[J + 1, 3, 3], frame to world, and origins f32[J + 1, 3] m of the frames; row 0 is the world's frame.
-      Axes f32[J, 3], MuJoCo's `xaxis`, and anchors f32[J, 3] m, MuJoCo's `xanchor`.
+      Rotations of the frames, f32[J + 1, 3, 3], frame to world. Origins of the frames, f32[J + 1, 3] m in world. Row 0
+      of both is the world's frame, row j + 1 the frame of joint j. Axes of the joints, f32[J, 3] in world (MuJoCo's
+      `xaxis`). Anchors of the joints, f32[J, 3] m in world (MuJoCo's `xanchor`).
     """
     num_joints, expand = joints.parent.shape[0], functools.partial(append_axes, count=values.ndim - 1)
     axis, is_slide, rotation = expand(joints.axis), expand(joints.is_slide), expand(joints.rotation)
@@ -145,15 +148,15 @@ def _axis_rotations(axis: Array, angle: Array) -> Array:
 
 
 def place(placement: Placement, rotations: Array, positions: Array) -> tuple[Array, Array]:
-    """Computes the world poses of bodies, geoms, sites or cameras.
+    """Computes the world poses of N bodies, geoms, sites or cameras.
 
     Args:
-      placement: the N items.
-      rotations: f32[J + 1, 3, 3], from `frames`.
-      positions: f32[J + 1, 3] m, from `frames`.
+      placement: to which joint frame each of the N items is fixed, and where.
+      rotations: f32[J + 1, 3, 3], frame to world, for the world and the J joints, from `frames`.
+      positions: f32[J + 1, 3] m in world, origins of these frames, from `frames`.
 
     Returns:
-      Positions f32[N, 3] m and rotations f32[N, 3, 3], item to world.
+      Positions of the items' origins, f32[N, 3] m in world. Rotations of the items, f32[N, 3, 3], item to world.
     """
     rotation = rotations[placement.frame]
     position = positions[placement.frame] + rotate(rotation, placement.position)
@@ -176,11 +179,11 @@ def _frame_poses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray
 
 
 def build_joints(model: mujoco.MjModel, data: mujoco.MjData) -> Joints:
-    """Returns all joints of a model.
+    """Converts all joints of a MuJoCo model into the arrays that `frames` reads.
 
     Args:
       model: a model whose joints are hinges or slides.
-      data: its kinematics at `qpos0`.
+      data: MuJoCo's data of the model, with the kinematics computed at `qpos0`.
     """
     body_frame = _body_frames(model)
     rotations, positions = _frame_poses(model, data)
@@ -201,11 +204,11 @@ def build_joints(model: mujoco.MjModel, data: mujoco.MjData) -> Joints:
 
 
 def build_placement(model: mujoco.MjModel, data: mujoco.MjData, kind: str) -> Placement:
-    """Returns where the elements of one kind are fixed.
+    """Finds to which joint frame each body, geom, site or camera of a model is fixed, and where.
 
     Args:
       model: a model whose joints are hinges or slides.
-      data: its kinematics at `qpos0`.
+      data: MuJoCo's data of the model, with the kinematics computed at `qpos0`.
       kind: "body", "geom", "site" or "cam".
     """
     body_frame = _body_frames(model)

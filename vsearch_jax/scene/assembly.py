@@ -71,12 +71,13 @@ class Scene:
 
 
 def build_scene(config: SceneConfig) -> Scene:
-    """Assembles table, lights, mount, arm, object and obstacles into one model.
+    """Assembles table, lights, mount, arm, object and obstacles into one MuJoCo model.
 
-    - The arm's base hangs from the mount. Its +z axis points down.
-    - The object is fixed at the world's origin. The joints of its file are removed.
+    - The arm's base hangs from the mount. The +z axis of the base points down.
+    - The object is fixed at the world's origin. The joints of the object's file are removed.
     - A mesh (OBJ, STL, MSH, PLY, GLB, GLTF, OFF) is moved: its lowest point onto the table, the middle of its bounding
-      box above the origin. `is_mesh_recentred=False` keeps its position. Holes and faces without area are logged.
+      box above the origin. `is_mesh_recentred=False` keeps the mesh where its file puts it. Holes, and faces without
+      area, are logged.
 
     Args:
       config: names or paths of arm, object and obstacles; mount height in m; view sphere.

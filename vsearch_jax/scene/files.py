@@ -24,18 +24,22 @@ class SceneError(ValueError):
 
 
 def xml_folder() -> Path:
-    """Returns the folder of the MJCF files, in the installed package or in a checkout."""
+    """Returns the folder of the package's own MJCF files, in the installed package or in a checkout."""
     packaged = Path(str(resources.files("vsearch_jax"))) / "xml"
     return packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "xml"
 
 
 def available(kind: str) -> tuple[str, ...]:
-    """Returns the names of the package's own files of a kind: "arm", "objects" or "obstacles"."""
+    """Returns the names of the arms, objects or obstacles that the package brings, for options and error messages.
+
+    Args:
+      kind: "arm", "objects" or "obstacles".
+    """
     return tuple(sorted(path.stem for path in (xml_folder() / kind).glob("*.xml")))
 
 
 def find_file(part: str, name: str) -> Path:
-    """Finds the file of a part.
+    """Returns the path of the file of an arm, an object or obstacles.
 
     Args:
       part: "arm", "object" or "obstacles".
@@ -75,7 +79,9 @@ def _load_mjcf(part: str, path: Path) -> mujoco.MjSpec:
 
 
 def load_arm(path: Path) -> mujoco.MjSpec:
-    """Loads an arm. Its actuators compensate gravity. The free joints of loose parts are removed.
+    """Loads an arm from an MJCF file, and prepares it to be attached to the scene.
+
+    The actuators get gravity compensation. The free joints of loose parts are removed.
 
     Raises:
       SceneError: the file cannot be loaded, it has no site `tcp` or no camera `wrist`, a joint is a ball, or a free
@@ -114,7 +120,7 @@ def _bodies_above(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> set[int]:
 
 
 def load_object(path: Path, config: SceneConfig) -> mujoco.MjSpec:
-    """Loads an object and removes its joints.
+    """Loads an object from an MJCF or mesh file and removes its joints, so that it does not move.
 
     Args:
       path: an MJCF or mesh file.
@@ -142,14 +148,14 @@ def load_object(path: Path, config: SceneConfig) -> mujoco.MjSpec:
 
 
 def load_static(part: str, path: Path) -> mujoco.MjSpec:
-    """Loads an MJCF file and removes its joints.
+    """Loads an object or obstacles from an MJCF file and removes all joints, so that nothing in it moves.
 
     Args:
-      part: name of the part in error messages: "object" or "obstacles".
-      path: the file.
+      part: word for error messages: "object" or "obstacles".
+      path: path of the MJCF file.
 
     Returns:
-      The part, without joints.
+      The content of the file, without joints.
 
     Raises:
       SceneError: the file cannot be loaded.

@@ -6,7 +6,7 @@ import mujoco
 
 
 def joints_above(model: mujoco.MjModel, body: int) -> list[int]:
-    """Returns MuJoCo's numbers of the joints that move a body, from the world outward.
+    """Returns MuJoCo's numbers of all joints that move a body, in order from the world to the body.
 
     Args:
       model: the compiled model.

@@ -45,7 +45,9 @@ class MeshReport:
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Returns vertices f64[V, 3] and faces i32[F, 3] of a mesh file. All parts of the file are merged.
+    """Reads the triangles of a mesh file: vertices f64[V, 3] and faces i32[F, 3] (numbers of vertices).
+
+    The vertices are in the unit of the file. All parts of the file are merged.
 
     Raises:
       MeshError: the file cannot be read, or has no triangle.
@@ -62,14 +64,16 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def inspect_mesh(vertices: np.ndarray, faces: np.ndarray) -> MeshReport:
-    """Counts the faults of a mesh. Vertices at equal positions count as one vertex.
+    """Measures the size of a mesh and counts its faults: triangles without area and edges of holes.
+
+    Vertices at equal positions count as one vertex.
 
     Args:
-      vertices: f64[V, 3] in any unit.
-      faces: i32[F, 3], indices of vertices.
+      vertices: f64[V, 3], positions of V vertices, in any unit.
+      faces: i32[F, 3], numbers of the vertices of F triangles.
 
     Returns:
-      The report.
+      The size and the counts.
     """
     positions, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]
@@ -83,15 +87,15 @@ def inspect_mesh(vertices: np.ndarray, faces: np.ndarray) -> MeshReport:
 
 
 def check_mesh(vertices: np.ndarray, faces: np.ndarray, max_size: float) -> MeshReport:
-    """Checks that a mesh can be seen by the wrist camera.
+    """Checks that a mesh has a size and a shape that the wrist camera can see.
 
     Args:
-      vertices: f64[V, 3] m.
-      faces: i32[F, 3], indices of vertices.
+      vertices: f64[V, 3] m, positions of V vertices.
+      faces: i32[F, 3], numbers of the vertices of F triangles.
       max_size: m, maximum length of the longest edge of the bounding box.
 
     Returns:
-      The report of the mesh.
+      Size and faults of the mesh, from `inspect_mesh`.
 
     Raises:
       MeshError: a coordinate is not finite, all faces lack area, or the mesh is too large or too small.
@@ -116,5 +120,5 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, max_size: float) -> Mesh
 
 
 def is_read_by_mujoco(path: Path) -> bool:
-    """Returns whether MuJoCo reads files with the suffix of `path`."""
+    """Returns whether MuJoCo can read a mesh file itself, judged by the suffix of `path`."""
     return path.suffix.lower() in _READ_BY_MUJOCO

@@ -79,11 +79,12 @@ class _State:
 
 
 def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: CMAESConfig) -> SearchResult:
-    """Searches the view sphere with CMA-ES. The strategy starts at the initial view and restarts where it stalls.
+    """Searches the view sphere with CMA-ES for the view with the best score.
 
-    The fitness of a sample is 1 - cosine; lower is better. Azimuth is periodic and has no bounds. A sample outside the
-    band is moved to the band's edge. Its squared distance to the band is added to the fitness (Hansen's boundary
-    handling with a fixed weight).
+    The search starts at the initial view and restarts where it stalls. A generation is the set of views (samples) whose
+    images are taken before the strategy adapts. The fitness of a sample is 1 - cosine; lower is better. Azimuth is
+    periodic and has no bounds. A sample outside the band (the elevations to search) is moved to the band's nearer end.
+    The sample's squared distance to the band is added to the fitness (Hansen's boundary handling with a fixed weight).
 
     Far from the target the cosine is nearly flat and has local optima. The plain strategy would converge to them. These
     rules prevent it:
@@ -97,19 +98,19 @@ def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: 
 
     Args:
       key: PRNG key.
-      score_fn: maps (view, args.task) to the score f32[], -inf where the arm cannot reach the view. `jax.vmap` is
-        applied to it over a generation.
-      args: SearchArgs of one problem.
+      score_fn: maps (view, args.task) to the score f32[]: cosine similarity to the target, or -inf where the arm cannot
+        reach the view. `jax.vmap` is applied to the function over a generation.
+      args: initial view, band, threshold and task of one search problem.
       config: CMAESConfig. `sigma_deg` is the initial sigma in azimuth. In elevation, sigma scales with the band.
 
     Returns:
-      SearchResult with best_scores f32[config.max_generations].
+      The best view, its score and the number of images taken; best_scores is f32[config.max_generations].
     """
     return run_search(key, score_fn, args, method(config))
 
 
 def method(config: CMAESConfig) -> Method[_State]:
-    """Returns the searcher in parts."""
+    """Returns CMA-ES in parts (start, ask, tell, record), for a caller that takes the images itself."""
     sigma = math.radians(config.sigma_deg) / _AZIMUTH_UNIT
     cma_es = CMA_ES(population_size=config.population, solution=jnp.zeros(2))
     with _evosax_promotion():

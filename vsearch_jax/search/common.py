@@ -29,7 +29,7 @@ class SearchArgs(Generic[Task_co]):
     Attributes:
       initial: View of f32[] rad, where the search starts. Its image is the first evaluation.
       band: f32[2] rad, lowest and highest elevation of the search.
-      threshold: f32[], score at which the search ends.
+      threshold: f32[], score from which the target counts as found; the search ends then.
       task: any pytree, for instance the target code. The searcher only passes it to `score_fn`.
     """
 
@@ -41,7 +41,9 @@ class SearchArgs(Generic[Task_co]):
 
 @flax.struct.dataclass
 class Record:
-    """What a search has found so far; G is the maximum number of generations.
+    """What a search has found so far. A generation is a set of views that the searcher asks for at once.
+
+    G is the maximum number of generations.
 
     Attributes:
       view: View of f32[] rad, the best view; the initial view if no other is better.
@@ -63,7 +65,9 @@ class Record:
 
 
 class Method(NamedTuple, Generic[SearchState]):
-    """A black-box searcher in parts, for callers that take the images themselves. N is `num_views`.
+    """A black-box searcher in parts, for callers that take the images themselves.
+
+    A generation is a set of N = `num_views` views that the searcher asks for at once.
 
     Attributes:
       start: (args, score of the initial view f32[]) -> state, a pytree.
@@ -84,13 +88,17 @@ class Method(NamedTuple, Generic[SearchState]):
 def run_search(
     key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], method: Method[SearchState]
 ) -> SearchResult:
-    """Runs a search until its score meets the threshold or its generations are used up.
+    """Runs one search until the best score meets the threshold, or until no generations are left.
 
     Args:
       key: PRNG key.
-      score_fn: maps (view, args.task) to the score f32[]. `jax.vmap` is applied to it over a generation's views.
-      args: SearchArgs of one problem.
+      score_fn: maps (view, args.task) to the score f32[]: cosine similarity to the target, or -inf where the arm cannot
+        reach the view. `jax.vmap` is applied to it over a generation (the views that the searcher asks for at once).
+      args: initial view, band of elevations, threshold and task of one search problem.
       method: the searcher.
+
+    Returns:
+      The best view, its score and the number of images taken.
     """
     state = method.start(args, score_fn(args.initial, args.task))
     body = functools.partial(_run_generation, key, score_fn, args, method)
@@ -107,11 +115,11 @@ def _run_generation(
 
 
 def start_record(view: View, score: Array, max_generations: int) -> Record:
-    """Returns the record after the image of the initial view.
+    """Starts the record of what a search has found: it holds the initial view and the one image taken there.
 
     Args:
-      view: the initial View of f32[] rad.
-      score: f32[], its score; -inf if the arm cannot reach it.
+      view: the initial view, f32[] rad.
+      score: f32[], score of the initial view; -inf if the arm cannot reach it.
       max_generations: number of generations after which the search gives up.
     """
     return Record(
@@ -126,33 +134,35 @@ def start_record(view: View, score: Array, max_generations: int) -> Record:
 
 
 def taken_images(scores: Array, threshold: Array) -> Array:
-    """Marks the images of a generation that are taken: all up to the first whose score meets the threshold.
+    """Marks which images of a generation are taken: all up to the first whose score meets the threshold.
+
+    A generation is a set of N views that the searcher asks for at once.
 
     Args:
-      scores: f32[N], scores of the views in the order in which their images are taken.
+      scores: f32[N], scores of the views in the order in which the images are taken.
       threshold: f32[], score at which the search ends.
 
     Returns:
-      bool[N].
+      bool[N], true for the images that are taken.
     """
     is_hit = (scores >= threshold).astype(jnp.int32)
     return jnp.cumsum(is_hit) - is_hit == 0
 
 
 def add_generation(record: Record, views: View, scores: Array, threshold: Array) -> Record:
-    """Adds one generation to the record.
+    """Adds one generation (N views that the searcher asked for at once) and its scores to the record.
 
     The images are taken one by one. The search ends with the first image that meets the threshold. The images after it
     are not taken: they are not counted and cannot become the best.
 
     Args:
-      record: Record before the generation.
-      views: View of f32[N] rad.
+      record: what the search found before the generation.
+      views: the views of the generation, f32[N] rad.
       scores: f32[N], scores of `views`; -inf where the arm cannot reach the view.
       threshold: f32[], score at which the search ends.
 
     Returns:
-      Record after the generation.
+      What the search has found after the generation.
     """
     is_taken = taken_images(scores, threshold)
     taken_scores = jnp.where(is_taken, scores, -jnp.inf)
@@ -174,20 +184,20 @@ def add_generation(record: Record, views: View, scores: Array, threshold: Array)
 
 
 def is_running(record: Record, threshold: Array) -> Array:
-    """Checks whether a search goes on: its score is below the threshold and it has generations left.
+    """Checks whether a search goes on: the best score is below the threshold, and generations are left.
 
     Args:
-      record: Record of the search.
+      record: what the search has found so far.
       threshold: f32[], score at which the search ends.
 
     Returns:
-      bool[].
+      bool[], true if the search goes on.
     """
     return (record.score < threshold) & (record.generation < record.best_scores.shape[0])
 
 
 def to_result(record: Record) -> SearchResult:
-    """Returns the SearchResult of a finished search. Its azimuth lies in [-pi, pi)."""
+    """Converts the record of a finished search to its result. The azimuth of the best view is wrapped to [-pi, pi)."""
     return SearchResult(
         view=View(azimuth=wrap_angle(record.view.azimuth), elevation=record.view.elevation),
         score=record.score,
@@ -198,16 +208,16 @@ def to_result(record: Record) -> SearchResult:
 
 
 def fold_into_band(elevation: Array, band: Array) -> Array:
-    """Reflects an elevation at the ends of the band until it lies inside.
+    """Moves elevations into the band of a search by reflection at the ends of the band.
 
     Reflection keeps the density of random samples smooth. Clipping would put many samples on the ends of the band.
 
     Args:
-      elevation: f32[...] rad.
+      elevation: f32[...] rad, elevations inside or outside the band.
       band: f32[2] rad, lowest and highest elevation. A band of zero width gives its one elevation.
 
     Returns:
-      f32[...] rad, inside the band.
+      Elevations inside the band, f32[...] rad.
     """
     width = band[1] - band[0]
     period = jnp.where(width > 0.0, 2.0 * width, 1.0)

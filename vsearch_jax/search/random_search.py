@@ -25,28 +25,32 @@ from vsearch_jax.types import SearchResult, View
 
 
 def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: RandomSearchConfig) -> SearchResult:
-    """Searches the view sphere with normal samples around the best view so far.
+    """Searches the view sphere for the view with the best score, by random samples around the best view so far.
 
-    The standard deviation of azimuth and elevation is k (1 - c) rad. Here c is the best score so far, at least -1. So
-    the samples spread further where the score is worse. Azimuth wraps. An elevation outside the band is reflected into
-    the band. The search ends at the threshold or after `config.max_epochs`. If the initial view meets the threshold,
-    the search takes one image only.
+    Samples are views from a normal distribution. An epoch takes the images of several samples. The standard deviation
+    of azimuth and elevation is k (1 - c) rad. Here c is the best score so far, at least -1. So the samples spread
+    further where the score is worse. Azimuth wraps. An elevation outside the band to search is reflected into the band.
+    The search ends at the threshold or after `config.max_epochs`. If the initial view meets the threshold, the search
+    takes one image only.
 
     Args:
       key: PRNG key.
-      score_fn: maps (view, args.task) to the score f32[], -inf where the arm cannot reach the view. `jax.vmap` is
-        applied to it over the samples of an epoch.
-      args: SearchArgs of one problem.
-      config: RandomSearchConfig.
+      score_fn: maps (view, args.task) to the score f32[]: cosine similarity to the target, or -inf where the arm cannot
+        reach the view. `jax.vmap` is applied to it over the samples of an epoch.
+      args: initial view, band, threshold and task of one search problem.
+      config: settings of random search: k, samples of an epoch, number of epochs.
 
     Returns:
-      SearchResult with best_scores f32[config.max_epochs].
+      The best view, its score and the number of images taken; best_scores is f32[config.max_epochs].
     """
     return run_search(key, score_fn, args, method(config))
 
 
 def method(config: RandomSearchConfig) -> Method[Record]:
-    """Returns the searcher in parts. Its state is the record."""
+    """Returns random search in parts (start, ask, tell, record), for a caller that takes the images itself.
+
+    The state of the search is the record of what the search has found.
+    """
     return Method(
         start=lambda args, score: start_record(args.initial, score, config.max_epochs),
         ask=functools.partial(_sample_views, config),

@@ -15,10 +15,10 @@ Results = TypeVar("Results")
 
 
 def map_in_batches(function: Callable[[Items], Results], items: Items, batch_size: int) -> Results:
-    """Maps `function` over the leading axis, `batch_size` items at a time.
+    """Applies `function` to each of N items, `batch_size` items at a time.
 
-    If `batch_size` does not divide the number of items, `jax.lax.map` compiles a second program for the remainder. This
-    function repeats the last item instead, so one program is enough.
+    If `batch_size` does not divide N, `jax.lax.map` compiles a second program for the remainder. `map_in_batches`
+    repeats the last item instead, so one program is enough.
 
     Args:
       function: maps one item to one result.
@@ -36,7 +36,7 @@ def map_in_batches(function: Callable[[Items], Results], items: Items, batch_siz
 
 
 def flatten_vmap(function: Callable[[Shared, Items], Results]) -> Callable[[Shared, Items], Results]:
-    """Makes `vmap` of a batched function call the function once, with a larger batch.
+    """Changes the `vmap` of a batched function: the function is called once, with one larger batch.
 
     Use it for functions that loop over their batch. Plain `vmap` would put a loop inside a loop.
 
@@ -44,8 +44,8 @@ def flatten_vmap(function: Callable[[Shared, Items], Results]) -> Callable[[Shar
       function: (shared, items with leading axis N) -> results with leading axis N.
 
     Returns:
-      The same function. Under `vmap` with axis size A over the second argument, it runs on A * N items. `vmap` over
-      the first argument raises NotImplementedError.
+      `function` with a new `vmap` rule. Under `vmap` with axis size A over the second argument, it runs on A * N items.
+      `vmap` over the first argument raises NotImplementedError.
     """
 
     def run_flat(shared: Shared, items: Items) -> Results:
@@ -59,16 +59,16 @@ def flatten_vmap(function: Callable[[Shared, Items], Results]) -> Callable[[Shar
 
 
 def batch_axis_last(function: Callable[[Shared, Items], Results]) -> Callable[[Shared, Items], Results]:
-    """Makes `vmap` of a function put the batch axis last.
+    """Changes the `vmap` of a function: the function is called once, on arrays with the batch axis last.
 
-    On CPU, XLA vectorises over the last axis. With the batch there, a gather also copies whole rows.
+    On CPU, XLA vectorises over the last axis. If the batch is the last axis, a gather also copies whole rows.
 
     Args:
       function: (shared, items) -> results. It must also accept items whose arrays have one more axis at the end, and
         then treat each position of that axis independently.
 
     Returns:
-      The same function. `vmap` over the first argument raises NotImplementedError.
+      `function` with a new `vmap` rule. `vmap` over the first argument raises NotImplementedError.
     """
 
     def run_last(shared: Shared, items: Items) -> Results:

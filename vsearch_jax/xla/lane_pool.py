@@ -26,7 +26,7 @@ TAIL_SHARES = (4, 4)
 
 
 class Job(NamedTuple, Generic[Problem, State, Result]):
-    """The functions that a lane runs. Each function handles one item.
+    """The functions that a lane (a slot that works on one problem at a time) runs. Each function handles one problem.
 
     Attributes:
       reset: (problem, state, is_new bool[]) -> state. Returns the start state of `problem` where `is_new`, else the
@@ -74,18 +74,24 @@ class _Run(NamedTuple, Generic[State, Result]):
 
 
 def queue_where(is_wanted: Array) -> Queue:
-    """Returns a queue of the problems with true `is_wanted` (bool[N]), in ascending order."""
+    """Returns a queue of those of N problems that are to be run, in ascending order of their numbers.
+
+    Args:
+      is_wanted: bool[N], true for a problem to run.
+    """
     return Queue(jnp.argsort(~is_wanted).astype(jnp.int32), jnp.sum(is_wanted, dtype=jnp.int32))
 
 
 def run(job: Job[Problem, State, Result], problems: Problem, queue: Queue, states: State, results: Result) -> Result:
-    """Runs the queued problems.
+    """Runs the queued ones of N problems on L lanes (slots that work on one problem at a time).
+
+    A lane takes the next problem of the queue as soon as its present problem is done.
 
     Args:
-      job: the functions to run.
+      job: the functions that start, step and finish one problem.
       problems: pytree, leading axis N.
-      queue: which problems to run.
-      states: pytree, leading axis L, one state for each lane. The values are overwritten.
+      queue: which problems to run, and in which order.
+      states: pytree, leading axis L, one state for each lane. Only the shapes matter; the values are overwritten.
       results: pytree, leading axis N, of the structure that `job.result` returns.
 
     Returns:

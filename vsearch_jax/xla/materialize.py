@@ -26,7 +26,9 @@ def _change_all(state: tuple[Array, Array, Tree]) -> tuple[Array, Array, Tree]:
 
 @jax.custom_jvp
 def materialize(tree: Tree, zero: Array) -> Tree:
-    """Returns `tree` unchanged, and forces XLA to write it to memory once.
+    """Returns `tree` unchanged, but forces XLA to compute its arrays once and to write them to memory.
+
+    Otherwise XLA on CPU may compute them again for each use.
 
     Args:
       tree: pytree of numeric arrays.
@@ -44,10 +46,10 @@ def _materialize_jvp(primals: tuple[Tree, Array], tangents: tuple[Tree, Array]) 
 
 
 def runtime_zero(values: Array) -> Array:
-    """Returns 0 as i32[]. It is computed at run time, so the compiler cannot know its value.
+    """Returns 0 as i32[], computed at run time, so that the compiler cannot know its value. `materialize` needs it.
 
     Args:
-      values: f32 of any shape. Must not be a compile-time constant.
+      values: f32 of any shape, from which the zero is computed. Must not be a compile-time constant.
     """
     values = jax.lax.stop_gradient(values)
     return jnp.any(jnp.where(values < 1e30, values, 0.0) > 1e30).astype(jnp.int32)

@@ -12,7 +12,7 @@ Tree = TypeVar("Tree")
 
 
 def tree_where(condition: Array, if_true: Tree, if_false: Tree) -> Tree:
-    """Selects one of two pytrees.
+    """Selects between two pytrees by a condition, leaf by leaf, as `jnp.where` does for arrays.
 
     Args:
       condition: bool[], or of a shape that broadcasts with every leaf.

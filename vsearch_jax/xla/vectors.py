@@ -12,10 +12,13 @@ Vector = tuple[Array, Array, Array]
 
 
 def dot(a: Vector, b: Vector) -> Array:
-    """Returns the inner product of two vectors, an array of the coordinates' shape.
+    """Returns the inner product of vectors that are stored by coordinate (Vector: the tuple of the arrays x, y and z).
 
     Args:
-      a: x, y and z of the first vector.
-      b: x, y and z of the second vector.
+      a: Vector, f32[...] for each coordinate.
+      b: Vector, f32[...] for each coordinate.
+
+    Returns:
+      f32[...], one inner product for each vector.
     """
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -14,7 +14,7 @@ NEVER_NEAR = 0.05
 
 
 class Geoms(NamedTuple):
-    """MuJoCo's numbers of the geoms.
+    """MuJoCo's numbers of the geoms, grouped by the part of the scene that they belong to.
 
     Attributes:
       arm: geoms of the arm, its fixed base included.
@@ -32,16 +32,17 @@ class Geoms(NamedTuple):
 def touching_pairs(
     model: mujoco.MjModel, data: mujoco.MjData, geoms: Geoms, is_for_planning: bool
 ) -> list[tuple[int, int]]:
-    """Lists the pairs of geoms that can touch, the table not included.
+    """Lists the pairs of geoms that can touch. Pairs with the table are not listed.
 
     Args:
       model: the compiled scene.
-      data: its kinematics at `qpos0`.
-      geoms: numbers of the geoms.
-      is_for_planning: whether to leave out pairs that never come nearer than `NEVER_NEAR`.
+      data: MuJoCo's data of the scene, with the kinematics computed at `qpos0`.
+      geoms: numbers of the geoms of arm, mount, object and obstacles.
+      is_for_planning: whether to leave out pairs whose distance is never below `NEVER_NEAR` (0.05 m).
 
     Returns:
-      Pairs of a moving geom of the arm and another geom. Each pair is listed once.
+      Pairs of MuJoCo's geom numbers. The first geom of a pair belongs to the arm and is moved by a joint. Each pair is
+      listed once.
     """
     moving = _moving_geoms(model, geoms)
     fixed = [*(g for g in geoms.arm if g not in moving), *geoms.mount, *geoms.object, *geoms.obstacles]
@@ -51,13 +52,13 @@ def touching_pairs(
 
 
 def table_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: Geoms, is_for_planning: bool) -> list[int]:
-    """Lists the moving geoms of the arm that can touch the table.
+    """Lists the geoms of the arm that are moved by a joint and can touch the table.
 
     Args:
       model: the compiled scene.
-      data: its kinematics at `qpos0`.
-      geoms: numbers of the geoms.
-      is_for_planning: whether to leave out geoms that never come nearer to the table than `NEVER_NEAR`.
+      data: MuJoCo's data of the scene, with the kinematics computed at `qpos0`.
+      geoms: numbers of the geoms of arm, mount, object and obstacles.
+      is_for_planning: whether to leave out geoms whose distance from the table is never below `NEVER_NEAR` (0.05 m).
 
     Returns:
       MuJoCo's numbers of the geoms.

@@ -22,10 +22,10 @@ from vsearch_jax.xla.vectors import Vector, dot
 
 
 class Axes(NamedTuple):
-    """Axes of C capsules in world.
+    """Axes of C capsules in world. A capsule's axis is the segment between the centres of its two end balls.
 
     Attributes:
-      center: Vector of f32[C] m, midpoints of the axes.
+      center: Vector (x, y and z) of f32[C] m, midpoints of the axes.
       half_axis: Vector of f32[C] m, vectors from the midpoint to one end.
     """
 
@@ -34,19 +34,19 @@ class Axes(NamedTuple):
 
 
 def pair_distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> Array:
-    """Computes the distance of each pair from the poses of the geoms.
+    """Computes the signed distances between the geoms of all collision pairs, from the poses of the geoms.
 
-    The penetration of a box or a cylinder is not measured: if the axis intersects the solid, the distance is minus the
-    capsule's radius.
+    If the axis of a capsule intersects a box or a cylinder, the distance is minus the capsule's radius. How deep the
+    axis lies inside is not measured.
 
     Args:
-      pairs: the N pairs that must not touch.
-      geom_xpos: f32[ngeom, 3] m, in world.
-      geom_xmat: f32[ngeom, 3, 3], geom to world.
-      table_height: f32[] m, world z.
+      pairs: the N pairs of geoms that must not touch.
+      geom_xpos: f32[ngeom, 3] m in world, origins of the geoms.
+      geom_xmat: f32[ngeom, 3, 3], rotations of the geoms, geom to world.
+      table_height: f32[] m, world z of the table.
 
     Returns:
-      f32[N] m, signed.
+      Signed distance of each pair, f32[N] m; negative in contact.
     """
     rotation = geom_xmat[pairs.geom]
     offset = primitives.rotate(rotation, primitives.coordinates(pairs.center))
@@ -56,15 +56,15 @@ def pair_distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_heigh
 
 
 def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
-    """Computes the axes of the C capsules from the frames of the joints.
+    """Computes the axes of all C capsules in world, from the frames of the joints.
 
     Args:
-      pairs: the pairs that must not touch.
-      rotations: f32[J + 1, 3, 3], frame to world, from `kinematics.frames`. A batch axis at the end is allowed.
-      positions: f32[J + 1, 3] m, in world, from `kinematics.frames`. A batch axis at the end is allowed.
+      pairs: the pairs of geoms that must not touch, and the C capsules of these pairs.
+      rotations: f32[J + 1, 3, 3], frame to world, for the world and the J joints, from `kinematics.frames`.
+      positions: f32[J + 1, 3] m in world, origins of these frames. Both arrays may have a batch axis at the end.
 
     Returns:
-      Axes in world, with the batch axis at the end.
+      Axes of the C capsules in world; the batch axis, if any, is at the end.
     """
     frame = pairs.placement.frame
     expand = functools.partial(append_axes, count=positions.ndim - 2)
@@ -75,15 +75,17 @@ def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
 
 
 def distances_from_axes(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
-    """Computes the distance of each pair from the axes of the capsules; see `pair_distances`.
+    """Computes the signed distances between the geoms of all collision pairs, from the axes of the capsules.
+
+    `pair_distances` computes the same distances from the poses of the geoms.
 
     Args:
-      pairs: the N pairs that must not touch.
-      axes: axes of the capsules, from `capsule_axes`. A batch axis at the end is allowed.
-      table_height: f32[] m, world z.
+      pairs: the N pairs of geoms that must not touch.
+      axes: axes of the capsules in world, from `capsule_axes`. A batch axis at the end is allowed.
+      table_height: f32[] m, world z of the table.
 
     Returns:
-      f32[N] m, signed, with the batch axis at the end.
+      Signed distance of each pair, f32[N] m, negative in contact; the batch axis, if any, is at the end.
     """
     center, half_axis = axes
     expand = functools.partial(append_axes, count=center[0].ndim - 1)
@@ -123,12 +125,12 @@ def _axes_in_solid_frames(solids: Solids, axes: Axes, expand: Callable[[Array], 
 
 
 def min_distance(pairs: Pairs, gap: Array, part: int) -> Array:
-    """Returns the minimum distance f32[] in m from one part; +inf if no pair belongs to the part.
+    """Returns the arm's smallest distance f32[] in m from one part of the scene; +inf if no pair belongs to the part.
 
     Args:
-      pairs: the N pairs.
-      gap: f32[N] m, their distances.
-      part: TABLE, OBJECT, SELF or OBSTACLE.
+      pairs: the N pairs of geoms that must not touch.
+      gap: f32[N] m, signed distance of each pair, from `pair_distances`.
+      part: TABLE, OBJECT, SELF (the arm itself and the mount) or OBSTACLE.
     """
     return jnp.min(jnp.where(pairs.part == part, gap, jnp.inf), initial=jnp.inf)
 

@@ -17,19 +17,19 @@ SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def lever_arms(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[int, ...]) -> np.ndarray:
-    """Computes how fast each joint can move each geom.
+    """Computes an upper bound of how far one unit (rad or m) of each joint can move each geom.
 
-    The lever arm of a joint that does not move the geom is 0. The lever arm of a slide is 1. The lever arm of a hinge
-    is the maximum distance of the geom from the axis over all configurations. It is bounded by the triangle inequality
-    over the anchors of the joints between the hinge and the geom.
+    This bound is the lever arm of the joint. It is 0 for a joint that does not move the geom, and 1 for a slide. For a
+    hinge it is the maximum distance of the geom from the axis over all configurations. That distance is bounded by the
+    triangle inequality over the anchors of the joints between the hinge and the geom.
 
     Args:
       model: the model. The bodies that `joints` move have only hinges and slides.
-      data: its kinematics at `qpos0`.
+      data: MuJoCo's data of the model, with the kinematics computed at `qpos0`.
       joints: MuJoCo's numbers of the J joints.
 
     Returns:
-      f64[ngeom, J], upper bound of the motion in m of any point of the geom, for each unit (rad or m) of the joint.
+      Lever arms f64[ngeom, J], motion in m of any point of the geom for each unit (rad or m) of the joint.
     """
     levers = np.zeros((model.ngeom, len(joints)))
     column = {joint: i for i, joint in enumerate(joints)}
@@ -47,11 +47,11 @@ def extent_from_still_point(model: mujoco.MjModel, data: mujoco.MjData, geom: in
 
     Args:
       model: the model. The geom is moved by one joint or more, all hinges or slides.
-      data: its kinematics at `qpos0`.
+      data: MuJoCo's data of the model, with the kinematics computed at `qpos0`.
       geom: MuJoCo's number of the geom.
 
     Returns:
-      f64[3] m, the ball's centre in world, a point that no joint moves. The ball's radius in m.
+      The ball's centre, f64[3] m in world, a point that no joint moves. The ball's radius in m.
     """
     chain = joints_above(model, int(model.geom_bodyid[geom]))
     while len(chain) > 1 and model.jnt_type[chain[0]] == HINGE:

@@ -25,7 +25,7 @@ TABLE, OBJECT, SELF, OBSTACLE = range(4)
 
 @flax.struct.dataclass
 class Solids:
-    """N pairs of a capsule and a fixed solid.
+    """N pairs of a capsule and a fixed solid: a box, a cylinder or an ellipsoid.
 
     Attributes:
       capsule: i32[N], row of the capsule in `Pairs.geom`.
@@ -42,20 +42,21 @@ class Solids:
 
 @flax.struct.dataclass
 class Pairs:
-    """What must not touch: C capsules and N pairs.
+    """The N pairs of solids that must not touch, and the C capsules that take part in them.
 
-    The order of the pairs is: table, capsules, boxes, cylinders, ellipsoids.
+    The order of the pairs is: table, capsules, boxes, cylinders, ellipsoids. J joints, the chain,
+    move the wrist camera.
 
     Attributes:
       geom: i32[C], MuJoCo's number of the geom of each capsule.
       center: f32[C, 3] m, midpoint of the capsule in the geom's frame.
       half_axis: f32[C, 3] m, vector from the midpoint to one end of the axis, in the geom's frame.
-      radius: f32[C] m.
+      radius: f32[C] m, radius of the capsule.
       placement: Placement of the capsules, with their midpoints as positions. It serves callers without geom poses.
       frame_half_axis: f32[C, 3] m, `half_axis` in the joint frame of `placement`.
-      table: i32[M], rows of the capsules that must stay above the table.
-      first: i32[P], row of the first capsule of each pair of capsules.
-      second: i32[P], row of the second capsule of each pair of capsules.
+      table: i32[M], rows of the M capsules that must stay above the table.
+      first: i32[P], row of the first capsule of each of P pairs of capsules.
+      second: i32[P], row of the second capsule of each of P pairs of capsules.
       boxes: pairs of a capsule and a box. A mesh counts as its bounding box.
       cylinders: pairs of a capsule and a cylinder.
       ellipsoids: pairs of a capsule and an ellipsoid.
@@ -111,18 +112,21 @@ class _PairGroups(NamedTuple):
 def build_pairs(
     model: mujoco.MjModel, data: mujoco.MjData, geoms: Geoms, joints: tuple[int, ...], is_for_planning: bool
 ) -> Pairs:
-    """Builds the pairs that can touch by MuJoCo's rules: contact bits, weld groups, neighbours and excluded bodies.
+    """Builds the list of geom pairs that can touch, so that their distances can be computed.
+
+    MuJoCo's rules decide which pairs can touch: contact bits, weld groups, neighbours and excluded bodies. Each geom of
+    the arm becomes its enclosing capsule.
 
     Args:
       model: the compiled scene.
-      data: its kinematics at `qpos0`.
-      geoms: numbers of the geoms.
+      data: MuJoCo's data of the scene, with the kinematics computed at `qpos0`.
+      geoms: numbers of the geoms of arm, mount, object and obstacles.
       joints: MuJoCo's numbers of the J joints that planning moves.
-      is_for_planning: whether to leave out pairs that never come near, and to replace ellipsoids by enclosing capsules.
-        The distance from the capsule is never larger than the distance from the ellipsoid.
+      is_for_planning: whether to leave out pairs whose distance is never below `NEVER_NEAR` (0.05 m), and to replace
+        ellipsoids by enclosing capsules. The distance from the capsule is never larger than that from the ellipsoid.
 
     Returns:
-      The pairs.
+      The pairs, with bounds of how fast each joint changes their distances.
     """
     capsules = _capsule_geoms(model, geoms, is_for_planning)
     row = {geom: i for i, geom in enumerate(capsules)}

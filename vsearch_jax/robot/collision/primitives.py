@@ -29,26 +29,26 @@ NEWTON_ITERATIONS = 6
 
 
 def coordinates(vectors: Array) -> Vector:
-    """Returns the x, y and z coordinates, f32[...] each, of `vectors`, f32[..., 3]."""
+    """Splits vectors f32[..., 3] into a Vector, the tuple of their x, y and z coordinates (f32[...] each)."""
     return vectors[..., 0], vectors[..., 1], vectors[..., 2]
 
 
 def rotate(rotation: Array, vector: Vector) -> Vector:
-    """Rotates vectors.
+    """Rotates vectors that are stored by coordinate (Vector: the tuple of the arrays x, y and z).
 
     Args:
-      rotation: f32[..., 3, 3].
-      vector: Vector of f32[...].
+      rotation: f32[..., 3, 3], rotation matrices.
+      vector: Vector of f32[...], the vectors.
 
     Returns:
-      Vector of f32[...], `rotation` times `vector`.
+      The rotated vectors, Vector of f32[...]: `rotation` times `vector`.
     """
     x, y, z = (dot(coordinates(rotation[..., row, :]), vector) for row in range(3))
     return x, y, z
 
 
 def subtract(a: Vector, b: Vector) -> Vector:
-    """Returns a - b.
+    """Returns a - b for vectors that are stored by coordinate (Vector: the tuple of the arrays x, y and z).
 
     Args:
       a: Vector of f32[...].
@@ -58,31 +58,34 @@ def subtract(a: Vector, b: Vector) -> Vector:
 
 
 def add_scaled(a: Vector, s: Array, b: Vector) -> Vector:
-    """Returns a + s b.
+    """Returns a + s b for vectors that are stored by coordinate (Vector: the tuple of the arrays x, y and z).
 
     Args:
       a: Vector of f32[...].
-      s: f32[...], scale of `b`.
+      s: f32[...], factor of `b`.
       b: Vector of f32[...].
     """
     return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
 
 
 def length(vector: Vector) -> Array:
-    """Returns the length f32[...] of a Vector of f32[...]; at zero it is 1e-12 and its gradient is finite."""
+    """Returns the Euclidean length f32[...] of a Vector (x, y and z, f32[...] each).
+
+    At zero the length is 1e-12, and its gradient is finite.
+    """
     return jnp.sqrt(jnp.maximum(dot(vector, vector), 1e-24))
 
 
 def segment_distance(center_a: Vector, half_a: Vector, center_b: Vector, half_b: Vector) -> Array:
     """Returns the distance f32[...] in m between two segments (Ericson, Real-Time Collision Detection, 5.1.9).
 
-    A segment may be a point. Segments may be parallel.
+    A segment may be a point. Segments may be parallel. Each Vector is a tuple of x, y and z, f32[...] each.
 
     Args:
-      center_a: m, midpoint of the first segment.
-      half_a: m, vector from the midpoint of the first segment to one of its ends.
-      center_b: m, midpoint of the second segment.
-      half_b: m, vector from the midpoint of the second segment to one of its ends.
+      center_a: Vector in m, midpoint of the first segment.
+      half_a: Vector in m, from the midpoint of the first segment to one of its ends.
+      center_b: Vector in m, midpoint of the second segment.
+      half_b: Vector in m, from the midpoint of the second segment to one of its ends.
     """
     tiny = 1e-12
     offset = subtract(center_a, center_b)
@@ -102,13 +105,13 @@ def segment_box_distance(center: Vector, half_axis: Vector, size: Vector) -> Arr
     """Returns the distance f32[...] in m of a segment from a box; about 0 where the segment intersects the box.
 
     The squared distance is convex along the segment. It is quadratic between the points where the segment crosses the
-    planes of the faces. Its slope is therefore linear between the last such point with a negative slope and the first
-    one with a positive slope. The minimum lies at the zero of this line.
+    planes of the faces. Its slope is therefore linear between two neighbouring points. The minimum is where
+    the slope is 0, between the last point with a negative slope and the first point with a positive slope.
 
     Args:
-      center: m, midpoint of the segment in the box's frame.
-      half_axis: m, vector from the midpoint to one end, in the box's frame.
-      size: m, half sizes of the box.
+      center: Vector (x, y and z) in m, midpoint of the segment in the box's frame.
+      half_axis: Vector in m, from the midpoint to one end of the segment, in the box's frame.
+      size: Vector in m, half sizes of the box.
     """
 
     def offset_from_box(s: Array) -> Vector:
@@ -162,10 +165,10 @@ def segment_cylinder_distance(center: Vector, half_axis: Vector, radius: Array, 
     segment, so it lies above its tangents. The next point of a bracket is where the tangents of its two ends intersect.
 
     Args:
-      center: m, midpoint of the segment in the cylinder's frame.
-      half_axis: m, vector from the midpoint to one end, in the cylinder's frame.
-      radius: f32[...] m.
-      half_length: f32[...] m.
+      center: Vector (x, y and z) in m, midpoint of the segment in the cylinder's frame.
+      half_axis: Vector in m, from the midpoint to one end of the segment, in the cylinder's frame.
+      radius: f32[...] m, radius of the cylinder.
+      half_length: f32[...] m, half the length of the cylinder.
     """
 
     def tangent(s: Array) -> _Tangent:
@@ -197,15 +200,15 @@ def _tangent_intersection(low: _Tangent, high: _Tangent) -> Array:
 
 
 def ellipsoid_distance(point: Vector, size: Vector) -> Array:
-    """Returns the signed distance f32[...] in m of a point from an ellipsoid; negative inside.
+    """Returns the signed distance f32[...] in m of a point from an ellipsoid's surface; negative inside.
 
     The nearest point of the surface is r^2 p / (t + r^2), for each coordinate p and radius r. Here t is the largest
     root of sum (r p / (t + r^2))^2 = 1 (Eberly, Distance from a Point to an Ellipsoid). The sum is convex and falls
     with t. Newton's method therefore converges from the left, and never passes the root.
 
     Args:
-      point: m, in the ellipsoid's frame.
-      size: m, radii of the ellipsoid.
+      point: Vector (x, y and z) in m, in the ellipsoid's frame.
+      size: Vector in m, radii of the ellipsoid.
     """
     # The floor makes the nearest point unique at the centre and in the planes of symmetry.
     p = tuple(jnp.maximum(jnp.abs(x), 1e-7) for x in point)
@@ -223,9 +226,10 @@ def min_along_segment(distance: Callable[[Vector], Array], center: Vector, half_
     """Returns the minimum f32[...] in m of a convex function along a segment, by golden-section search.
 
     Args:
-      distance: maps points (Vector of f32[...]) to f32[...] m. Must be convex along each segment.
-      center: m, midpoint of the segment.
-      half_axis: m, vector from the midpoint to one end.
+      distance: the function. It maps points (Vector: x, y and z, f32[...] each) to f32[...] m. It must be convex along
+        each segment.
+      center: Vector in m, midpoint of the segment.
+      half_axis: Vector in m, from the midpoint to one end of the segment.
     """
 
     def distance_at(s: Array) -> Array:

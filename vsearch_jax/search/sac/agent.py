@@ -25,16 +25,18 @@ Params = TypeVar("Params", nnx.State, Array)
 
 
 def init(key: Array, config: SACConfig, observation_size: int, action_size: int = _ACTION_SIZE) -> SACState:
-    """Creates random networks. The target critics equal the critics.
+    """Creates the state of soft actor-critic before training: random networks and fresh optimizers.
+
+    The target critics equal the critics.
 
     Args:
       key: PRNG key.
-      config: SACConfig.
-      observation_size: number of entries in an obs.
+      config: settings of soft actor-critic.
+      observation_size: number of entries in an obs, the policy's input vector.
       action_size: number of entries in an action.
 
     Returns:
-      SACState before the first update.
+      Parameters and optimizer states before the first update.
     """
     actor_key, critic_key = jax.random.split(key)
     actor = init_network(actor_key, Actor, (observation_size, *config.hidden_sizes, 2 * action_size))
@@ -52,17 +54,17 @@ def init(key: Array, config: SACConfig, observation_size: int, action_size: int 
 
 
 def act(key: Array | None, actor: nnx.State, obs: Array, config: SACConfig, action_size: int = _ACTION_SIZE) -> Array:
-    """Computes the policy's action.
+    """Computes the policy's action, random or deterministic.
 
     Args:
       key: PRNG key of a random action. None gives the deterministic action: tanh of the mean.
       actor: parameters of the policy.
-      obs: f32[..., D].
-      config: the SACConfig with which `actor` was created.
+      obs: f32[..., D], input vectors of the policy, D numbers each.
+      config: the settings with which `actor` was created.
       action_size: number of entries A in the action.
 
     Returns:
-      f32[..., A] in [-1, 1].
+      Actions, f32[..., A] in [-1, 1].
     """
     distribution = NormalTanhDistribution(action_size)
     parameters = _action_parameters(actor, obs, config, action_size)
@@ -74,19 +76,19 @@ def act(key: Array | None, actor: nnx.State, obs: Array, config: SACConfig, acti
 def update(
     key: Array, state: SACState, transitions: Transition, config: SACConfig
 ) -> tuple[SACState, dict[str, Array]]:
-    """Takes one gradient step of critics, actor and temperature, then updates the target critics.
+    """Trains the policy by one gradient step of critics, actor and temperature, then updates the target critics.
 
     All three gradients are computed at the parameters of `state`.
 
     Args:
       key: PRNG key.
-      state: SACState before the step.
-      transitions: Transition with a leading batch axis.
-      config: SACConfig.
+      state: parameters and optimizer states before the step.
+      transitions: a batch of episode steps, for example from the replay buffer; the batch axis leads.
+      config: settings of soft actor-critic.
 
     Returns:
-      SACState after the step, and metrics f32[]: `critic_loss`, `actor_loss`, `alpha` (the temperature before the
-      step), `entropy` in nats.
+      Parameters and optimizer states after the step, and metrics f32[]: `critic_loss`, `actor_loss`, `alpha` (the
+      temperature before the step), `entropy` in nats.
     """
     target_key, actor_key = jax.random.split(key)
     target = td_target(target_key, state, transitions, config)
@@ -113,19 +115,19 @@ def update(
 
 
 def td_target(key: Array, state: SACState, transitions: Transition, config: SACConfig) -> Array:
-    """Computes the target values of the critics: r + discount (min_i Q_i(s', a') - alpha log pi(a'|s')).
+    """Computes the values that the critics must learn: r + discount (min_i Q_i(s', a') - alpha log pi(a'|s')).
 
     After a terminated step the future value is 0. After a truncated step the future value counts, because such a step
     has `terminated` = 0.
 
     Args:
       key: PRNG key of the next actions a'.
-      state: SACState. The target critics give Q_i, the actor gives pi.
-      transitions: Transition with a leading batch axis B.
-      config: SACConfig.
+      state: parameters. The target critics give Q_i, the actor gives pi.
+      transitions: a batch of B episode steps; the batch axis leads.
+      config: settings of soft actor-critic; the discount is read.
 
     Returns:
-      f32[B].
+      Target value of each step, f32[B].
     """
     obs = transitions.next_obs
     action, log_prob = _sample_action(key, state.actor, obs, config, transitions.action.shape[-1])

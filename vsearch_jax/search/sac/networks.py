@@ -67,7 +67,7 @@ Network: TypeAlias = Actor | Critic
 
 
 def init_network(key: Array, network: type[Network], sizes: tuple[int, ...]) -> nnx.State:
-    """Creates random parameters.
+    """Creates random parameters of a policy network (Actor) or value network (Critic).
 
     Args:
       key: PRNG key.
@@ -81,16 +81,16 @@ def init_network(key: Array, network: type[Network], sizes: tuple[int, ...]) -> 
 
 
 def apply_network(network: type[Network], sizes: tuple[int, ...], params: nnx.State, *inputs: Array) -> Array:
-    """Evaluates a network.
+    """Computes the output of a policy network (Actor) or value network (Critic) for given inputs.
 
     Args:
       network: Actor or Critic.
       sizes: number of units of each layer, from the input to the output.
       params: parameters from `init_network` with the same `network` and `sizes`.
-      *inputs: arguments of the network, f32[..., size].
+      *inputs: f32[..., size] each: the obs for an Actor; the obs and the action for a Critic.
 
     Returns:
-      Output of the network, f32[..., sizes[-1]] of an Actor, f32[...] of a Critic.
+      Distribution parameters f32[..., sizes[-1]] from an Actor, values f32[...] from a Critic.
     """
     return nnx.merge(_graphdef(network, sizes), params)(*inputs)
 

@@ -75,33 +75,34 @@ class _LoopState:
 
 
 def search(key: Array, step_fn: StepFn, args: SearchArgs[PolicyTask], config: Config) -> SearchResult:
-    """Runs one episode of a policy. It ends when the threshold is met or after `config.env.episode_length` steps.
+    """Searches for the target view with a trained policy in one episode. A local search helps where the policy stalls.
 
-    The policy takes its mean action. In a few of 1000 episodes it would move in a circle, mostly near the target. There
-    a local search chooses the step instead of the policy. It does so if the step before made no progress, and the best
+    The episode ends when the similarity meets the threshold or after `config.env.episode_length` steps. The policy
+    takes its mean action. In a few of 1000 episodes the policy would move in a circle, mostly near the target. There a
+    local search chooses the step instead of the policy. It does so if the step before made no progress, and the best
     view is near the target or `config.evaluation.patience` steps are done. It also does so after a step that the arm
-    could not do. The policy would repeat that step forever, because its action depends on the obs only.
+    could not do. The policy would repeat that step forever, because its action depends on its input only.
 
     The local search has two kinds of steps:
 
-    - Near the target it tries views around the best view. Their distance from the best view is an estimate of the
-      target's distance: 1 - score grows with the square of that distance. The direction of the target is unknown.
-      Therefore the direction turns by 90 degrees in each step. After every 4 steps the distance grows.
+    - Near the target it tries views around the best view. The distance of these views from the best view is an estimate
+      of the target's distance: 1 - score grows with the square of that distance. The direction of the target is
+      unknown. Therefore the direction turns by 90 degrees in each step. After every 4 steps the distance grows.
     - Far from the target it moves around the object in one direction, with random elevations.
 
-    Each step is one generation of one image. The image of the initial view is not counted, because the result of a
+    Each step takes one image. The image of the initial view is not counted, because the result of a
     policy is its number of steps. An episode has at least one step, even if the initial view meets the threshold, as in
     training.
 
     Args:
       key: PRNG key of the local search.
       step_fn: the environment's `step`.
-      args: SearchArgs of one problem. `initial` is the view of `task.start`.
-      config: Config of the run. Only `sac`, `env` and `evaluation.patience` are used.
+      args: the search problem. `task` holds the policy and the brax State at the start; `initial` is the view there.
+      config: the run's config. Only `sac`, `env` and `evaluation.patience` are used.
 
     Returns:
-      SearchResult with best_scores f32[episode_length] and with `end`. `view` and `score` are those of the
-      episode's last view, not of its best view.
+      Last view of the episode (not the best one), its score, and the number of steps. best_scores is
+      f32[episode_length]. `end` holds the last brax State and the cost of the motions.
     """
     record = start_record(args.initial, jnp.asarray(-jnp.inf, jnp.float32), config.env.episode_length)
     record = dataclasses.replace(record, evaluations=jnp.int32(0), unreachable=jnp.int32(0))

@@ -14,24 +14,25 @@ from vsearch_jax.types import Transition
 def relabel(
     key: Array, transitions: Transition, candidate_codes: Array, env_config: EnvConfig, config: SACConfig
 ) -> Transition:
-    """Replaces the target of some transitions, and computes reward and `terminated` of all of them anew.
+    """Relabels replayed episode steps: replaces the target of some, then computes reward and `terminated` of all anew.
 
-    A fraction `config.relabel_fraction` of the batch gets a new target. For two thirds of it, the target is a random
+    A fraction `config.relabel_fraction` of the batch gets a new target. For two thirds of these, the target is a random
     one of `candidate_codes`. For one third, the target is the code after the transition's own step, so that the step is
     a success.
 
-    A transition whose step was unreachable gets `unreachable_reward` and does not terminate, as in the environment. It
-    never gets its own code as target, because its step leads to no target.
+    A transition whose step was unreachable gets `unreachable_reward` and does not terminate, as in the environment. Its
+    new target is always one of `candidate_codes`, because the step leads to no view.
 
     Args:
       key: PRNG key.
-      transitions: Transition with a leading batch axis. Each obs is code, target code and joint values in one vector.
-      candidate_codes: f32[N, Z], codes of reachable views.
+      transitions: a batch of episode steps; the batch axis leads. Each obs is code, target code and joint values in one
+        vector.
+      candidate_codes: f32[N, Z], image codes of N reachable views, Z numbers each.
       env_config: threshold and rewards.
-      config: SACConfig.
+      config: settings of soft actor-critic.
 
     Returns:
-      Transition with the same batch axis.
+      The relabelled steps, in the same order.
     """
     num, size = transitions.reward.shape[0], candidate_codes.shape[-1]
     choice_key, candidate_key = jax.random.split(key)

@@ -14,28 +14,28 @@ from vsearch_jax.types import ReplayState, Transition
 
 
 def init_replay(example: Transition, capacity: int) -> ReplayState:
-    """Creates an empty buffer.
+    """Creates an empty replay buffer for episode steps (transitions).
 
     Args:
-      example: one Transition without a batch axis. Its shapes and dtypes count, its values do not.
-      capacity: maximum number of transitions.
+      example: one Transition without a batch axis. Only shapes and dtypes are read.
+      capacity: maximum number of transitions in the buffer.
 
     Returns:
-      ReplayState without transitions.
+      The buffer, without transitions.
     """
     data = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), example)
     return ReplayState(data=data, num_inserted=jnp.zeros((), jnp.int32))
 
 
 def insert(replay: ReplayState, transitions: Transition) -> ReplayState:
-    """Inserts transitions. They overwrite the oldest ones if the buffer is full.
+    """Inserts new episode steps (transitions) into the replay buffer. In a full buffer they overwrite the oldest ones.
 
     Args:
-      replay: ReplayState.
-      transitions: Transition with a leading batch axis, not longer than the capacity.
+      replay: the buffer before the insertion.
+      transitions: the new transitions, with a leading batch axis, not longer than the capacity.
 
     Returns:
-      ReplayState with the transitions.
+      The buffer after the insertion.
     """
     count, capacity = transitions.reward.shape[0], replay.data.reward.shape[0]
     index = (replay.num_inserted + jnp.arange(count)) % capacity
@@ -44,15 +44,15 @@ def insert(replay: ReplayState, transitions: Transition) -> ReplayState:
 
 
 def sample_batch(key: Array, replay: ReplayState, batch_size: int) -> Transition:
-    """Draws transitions uniformly, with replacement.
+    """Draws a random batch of episode steps (transitions) from the replay buffer, uniformly and with replacement.
 
     Args:
       key: PRNG key.
-      replay: ReplayState with at least one transition.
+      replay: the buffer, with at least one transition.
       batch_size: number of transitions to draw.
 
     Returns:
-      Transition with leading axis `batch_size`.
+      The drawn transitions: a Transition with leading axis `batch_size`.
     """
     num_filled = jnp.minimum(replay.num_inserted, replay.data.reward.shape[0])
     index = jax.random.randint(key, (batch_size,), 0, num_filled)
