@@ -34,9 +34,9 @@ def evaluate(run: Path, out: Path, episodes: int, target_deg: tuple[float, float
       batch_size: episodes that run side by side.
     """
     config = runs.read_config(run)
-    template = jax.eval_shape(lambda key: vs.init(key, config), jax.random.key(0))
-    state = runs.restore(run, template, config)
+    state = runs.resume_run(run, config)
     runs.check_finished(run, state, config)
+    runs.make_new_folder(out)
     settings = dataclasses.replace(
         config.evaluation,
         num_episodes=episodes,
@@ -49,7 +49,6 @@ def evaluate(run: Path, out: Path, episodes: int, target_deg: tuple[float, float
     began = time.perf_counter()
     arrays = vs.evaluate(state, config)
     seconds = time.perf_counter() - began
-    runs.make_new_folder(out)
     search = jax.tree.map(np.asarray, record_search(state, config))
     lines = runs.read_metrics(run)
     evaluated = runs.Evaluated(arrays, search, state.reach, lines, {"evaluation": seconds}, runs.read_seed(run))

@@ -8,9 +8,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import jax
-
-import vsearch_jax as vs
 from vsearch_jax import runs
 from vsearch_jax.export.stablehlo import export
 
@@ -24,8 +21,7 @@ def export_run(run: Path, out: Path, policy: int) -> None:
       policy: which of the run's policies.
     """
     config = runs.read_config(run)
-    template = jax.eval_shape(lambda key: vs.init(key, config), jax.random.key(0))
-    state = runs.restore(run, template, config)
+    state = runs.resume_run(run, config)
     runs.check_finished(run, state, config)
     runs.make_new_folder(out)
     export(out, state, config, policy)

@@ -11,9 +11,9 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("MPLBACKEND", "agg")
 
-import hypothesis  # noqa: E402
-import jax  # noqa: E402
-import pytest  # noqa: E402
+import hypothesis  # noqa: E402 # below the settings above
+import jax  # noqa: E402 # reads the variables above
+import pytest  # noqa: E402 # below the settings above
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -22,7 +22,15 @@ hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=No
 hypothesis.settings.load_profile("repeatable")
 
 # Files that take minutes, each on one worker: they start first, so that none is left alone at the end.
-LONG = ("test_training.py", "test_evaluation.py", "test_ik.py", "test_planning.py", "test_cli.py")
+LONG = (
+    "test_training.py",
+    "test_lowering.py",
+    "test_evaluation.py",
+    "test_ik.py",
+    "test_planning.py",
+    "test_train_command.py",
+    "test_interrupted_training.py",
+)
 JAX_VERSION = tuple(int(part) for part in jax.__version__.split(".")[:2])
 
 

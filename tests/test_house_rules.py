@@ -1,4 +1,4 @@
-"""Rules of the house that a tool can count: sizes, types, suppressions, docstrings. DESIGN: CONTRIBUTING.md."""
+"""Rules of the house that a tool can count: sizes, types, suppressions, docstrings. CONTRIBUTING.md states them."""
 
 import ast
 import io
@@ -16,7 +16,7 @@ PACKAGE = sorted((ROOT / "vsearch_jax").rglob("*.py"))
 SOURCES = [*PACKAGE, *(path for folder in ("train", "eval", "tests") for path in sorted((ROOT / folder).rglob("*.py")))]
 SUPPRESSION = re.compile(r"(pyright: ignore|type: ignore|noqa)")
 MAX_LINES, MAX_FUNCTION_LINES, MAX_ARGUMENTS = 300, 60, 6
-MAX_TOP_LEVEL_MODULES, MAX_ANY, MAX_SUPPRESSIONS = 7, 59, 12
+MAX_TOP_LEVEL_MODULES, MAX_ANY, MAX_SUPPRESSIONS = 7, 59, 4
 
 
 def _comments(path: Path) -> Iterator[str]:
@@ -52,7 +52,7 @@ def test_the_word_any_is_rare() -> None:
 
 
 def test_suppressions_are_few_and_each_has_its_reason() -> None:
-    found = [comment for path in PACKAGE for comment in _comments(path) if SUPPRESSION.search(comment)]
+    found = [comment for path in SOURCES for comment in _comments(path) if SUPPRESSION.search(comment)]
     assert len(found) <= MAX_SUPPRESSIONS, found
     for comment in found:
         assert re.search(r"(?:ignore\[\w+\]|noqa: \w+) # \w+", comment), f"say why: {comment}"

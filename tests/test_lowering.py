@@ -1,4 +1,4 @@
-"""`train` and `evaluate` compile for accelerators that this machine does not have, up to the compiler's own input."""
+"""`train` and `evaluate` lower for CUDA and TPU: every operation has a translation for these platforms."""
 
 import dataclasses
 import functools
@@ -10,7 +10,7 @@ import pytest
 
 import vsearch_jax as vs
 
-# One seed, silhouettes: everything that loops is there, and less is traced.
+# Silhouettes: all loops are there, and less code is traced.
 _SMOKE = vs.Config.preset("smoke")
 CONFIG = dataclasses.replace(_SMOKE, encoder=dataclasses.replace(_SMOKE.encoder, input="silhouette"))
 
@@ -21,11 +21,13 @@ def state():
 
 
 @pytest.mark.parametrize("function", [vs.train, vs.evaluate], ids=["train", "evaluate"])
-def test_a_whole_run_lowers_for_cuda_and_tpu(function, state) -> None:
+def test_a_whole_run_lowers_for_cuda_and_tpu(function, state, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What depends on the platform (lanes, tiles, convolutions, the fusion boundary) is traced as on a GPU.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     program = jax.jit(functools.partial(function, config=CONFIG))
     exported = jax.export.export(program, platforms=("cuda", "tpu"))(state)
     assert exported.platforms == ("cuda", "tpu")
     text = exported.mlir_module()
-    assert len(re.findall(r"stablehlo\.while", text)) > 50
+    assert len(re.findall(r"stablehlo\.while", text)) > 20
     # A callback would run on the host at every step.
     assert "callback" not in text

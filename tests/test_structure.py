@@ -1,11 +1,13 @@
-"""What holds for the tree as a whole: the wheel works outside the checkout, files stay small, names are as promised."""
+"""What holds for the tree as a whole: public names, pins, linters in `make test`, the wheel, the version."""
 
+import importlib.metadata
 import os
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import vsearch_jax
@@ -41,6 +43,19 @@ def test_make_test_calls_every_hook_of_pre_commit() -> None:
         assert hook.replace(".venv", "$(VENV)") in makefile
 
 
+def check_files_of_the_wheel(site: Path) -> None:
+    """Checks the files of an installed wheel that are not Python, and its console script."""
+    package = site / "vsearch_jax"
+    assert (package / "py.typed").is_file()
+    assert "<html" in (package / "report" / "page.html").read_text(encoding="utf-8")
+    with np.load(package / "cli" / "selftest.npz") as stored:
+        assert stored.files and all(stored[name].size for name in stored.files)
+    (distribution,) = importlib.metadata.distributions(name="vsearch_jax", path=[str(site)])
+    assert [(script.name, script.value) for script in distribution.entry_points] == [
+        ("vsearch", "vsearch_jax.cli.main:main")
+    ]
+
+
 def test_the_wheel_works_outside_the_checkout(tmp_path: Path) -> None:
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     wheel = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path / "wheel"), str(ROOT)]
@@ -48,6 +63,7 @@ def test_the_wheel_works_outside_the_checkout(tmp_path: Path) -> None:
     (built,) = (tmp_path / "wheel").glob("*.whl")
     site = tmp_path / "site"
     subprocess.run([*pip, "install", "--no-deps", "--no-index", "--target", str(site), str(built)], check=True)
+    check_files_of_the_wheel(site)
     code = (
         "import vsearch_jax; from vsearch_jax.config import SceneConfig; from vsearch_jax.scene import build_scene;"
         "print(vsearch_jax.__file__, build_scene(SceneConfig()).mj_model.nq)"
@@ -60,7 +76,5 @@ def test_the_wheel_works_outside_the_checkout(tmp_path: Path) -> None:
 
 
 def test_version_is_that_of_the_project_file() -> None:
-    import importlib.metadata
-
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert importlib.metadata.version("vsearch_jax") == project["version"]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +14,11 @@ import pytest
 import vsearch_jax as vs
 from vsearch_jax import training
 from vsearch_jax.runs import checkpoint
+from vsearch_jax.runs.old_versions import current_names
 
 CONFIG = vs.Config.preset("smoke")
+ARRAYS_OF_0_1_0 = Path(__file__).parent / "samples" / "arrays_of_0_1_0.json"
+"""Shape and dtype of each array in a checkpoint that version 0.1.0 wrote for the preset smoke."""
 
 
 def arrays(state):
@@ -115,6 +120,20 @@ def test_restored_run_equals_an_uninterrupted_run_bit_for_bit(chunked, tmp_path)
         restored, _ = vs.train(restored, CONFIG)
     for path, expected in arrays(chunked[0]).items():
         np.testing.assert_array_equal(arrays(restored)[path], expected, err_msg=path)
+
+
+def test_the_arrays_of_version_0_1_0_are_those_of_this_version(chunked):
+    def describe(leaf):
+        leaf = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        return [list(leaf.shape), str(leaf.dtype)]
+
+    stored = json.loads(ARRAYS_OF_0_1_0.read_text())
+    names = current_names(stored, "0.1.0")
+    assert len(set(names.values())) == len(names)
+    assert {current: stored[old] for old, current in names.items()} == {
+        jax.tree_util.keystr(path, simple=True, separator="."): describe(leaf)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(chunked[0])
+    }
 
 
 def test_initial_parameters_depend_on_the_seed():

@@ -38,18 +38,20 @@ def train(folder: Path, config: vs.Config, seed: int) -> None:
         began = time.perf_counter()
         state, metrics = vs.train(state, config)  # one chunk; `config.num_chunks` of them are the run
         done = int(state.step)
+        seconds = time.perf_counter() - began
         # The last chunk may be shorter than its arrays.
-        log.append(
-            {name: np.asarray(x)[: done - step] for name, x in metrics.items()}, step, time.perf_counter() - began
-        )
+        log.append({name: np.asarray(x)[: done - step] for name, x in metrics.items()}, step, seconds)
         runs.save(folder, state, config)
-        print(f"{done}/{config.num_iterations} {log.lines[-1]}")
+        print(f"{done}/{config.num_iterations} iterations, {seconds:.1f} s")
         step = done
     log.close()
 
     began = time.perf_counter()
     arrays = vs.evaluate(state, config)  # every searcher, all trials in one jitted call
-    wall_seconds = {"training": sum(line["seconds"] for line in log.lines), "evaluation": time.perf_counter() - began}
+    wall_seconds: dict[str, float] = {
+        stage: sum(line["seconds"] for line in log.lines if line["stage"] == stage) for stage in ("encoder", "policy")
+    }
+    wall_seconds["evaluation"] = time.perf_counter() - began
     evaluated = runs.Evaluated(
         arrays=arrays,
         search=jax.tree.map(np.asarray, record_search(state, config)),

@@ -32,8 +32,8 @@ POLICY_METRICS = ("reward", "similarity", "success_rate", "unreachable_rate", *_
 
 _ENCODER_INIT, _SAC_INIT, _ENCODER, _POOL, _RESTART, _POLICY = range(6)
 """Folded into the run's key, one for each purpose, so that no two purposes share random numbers."""
-_POOL_BATCH_SIZE = 64
-"""Number of views of the pool that are rendered at a time."""
+_POOL_BATCH_SIZE, _CPU_POOL_BATCH_SIZE = 1024, 64
+"""Number of views of the pool that are rendered at a time: on accelerators, and on CPU."""
 
 
 class _PolicyCarry(NamedTuple):
@@ -177,7 +177,8 @@ def _finish_encoder(index: Array, state: TrainState, *, config: Config) -> Train
     """
     env = ViewSearchEnv(config, state.encoder, state.reach)
     keys = jax.random.split(jax.random.fold_in(state.key, _POOL + index), config.encoder.pool_size)
-    pool, raw = jax.lax.map(functools.partial(_raw_observation, env), keys, batch_size=_POOL_BATCH_SIZE)
+    batch_size = _CPU_POOL_BATCH_SIZE if jax.default_backend() == "cpu" else _POOL_BATCH_SIZE
+    pool, raw = jax.lax.map(functools.partial(_raw_observation, env), keys, batch_size=batch_size)
     mean, whitening = encoders.fit_whitening(raw, config.encoder.whitening_power)
     encoder = dataclasses.replace(state.encoder, latent_mean=mean, whitening=whitening)
     pool = dataclasses.replace(pool, code=jax.vmap(functools.partial(encoders.code_of, encoder))(raw))

@@ -1,4 +1,4 @@
-"""Compares the renderer with its peers in one run: `python eval/benchmarks/render.py render --out runs/benchmark`.
+"""Compares the renderer with its peers in one run: `python eval/benchmarks/render.py --out runs/benchmark`.
 
 The peers are mj_multiRay, mujoco.Renderer and embree. Install them with the extra `benchmark`.
 """
@@ -202,15 +202,11 @@ def run(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Reads the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    subparsers = parser.add_subparsers(required=True)
-    command = subparsers.add_parser("render", help="compare with mj_multiRay, mujoco.Renderer and embree")
-    command.add_argument("--out", type=Path, default=Path("runs/benchmark"), help="folder to write")
-    command.add_argument("--batch", type=int, nargs="+", default=[1, 16, 64], help="images of one batch")
-    command.add_argument("--size", type=int, nargs="+", default=[64, 128], help="edge of an image in pixels")
-    command.add_argument("--seconds", type=float, default=2.0, help="measuring time of each rate")
-    command.set_defaults(run=run)
-    arguments = parser.parse_args()
-    arguments.run(arguments)
+    parser.add_argument("--out", type=Path, default=Path("runs/benchmark"), help="folder to write")
+    parser.add_argument("--batch", type=int, nargs="+", default=[1, 16, 64], help="images of one batch")
+    parser.add_argument("--size", type=int, nargs="+", default=[64, 128], help="edge of an image in pixels")
+    parser.add_argument("--seconds", type=float, default=2.0, help="measuring time of each rate")
+    run(parser.parse_args())
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import statistics
 import time
@@ -14,6 +15,9 @@ import jax
 T = TypeVar("T")
 Row = dict[str, str | int | float | bool | None]
 
+# A call longer than this is timed once.
+LONG_CALL_SECONDS = 5.0
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -21,7 +25,7 @@ class Settings:
 
     Attributes:
       is_quick: use sizes that two CPU cores finish in seconds.
-      deadline: `time.perf_counter()` at which the script has to end.
+      deadline: `time.perf_counter()` after which no new measurement begins.
       seconds: how long each rate is measured, in s.
     """
 
@@ -31,8 +35,12 @@ class Settings:
 
     @property
     def seconds_left(self) -> float:
-        """Seconds until the deadline."""
+        """Seconds until the deadline; negative after it."""
         return self.deadline - time.perf_counter()
+
+    def share(self, part: float) -> Settings:
+        """Returns settings for one section that may use `part` (0 to 1) of the time left."""
+        return dataclasses.replace(self, deadline=time.perf_counter() + part * max(self.seconds_left, 0.0))
 
 
 @dataclass(frozen=True)
@@ -61,14 +69,18 @@ def compile_program(function: Callable[..., T], *arguments: object) -> Compiled:
 
 
 def rate(call: Callable[[], object], count: int, seconds: float) -> float:
-    """Returns items per second: the median over repeated calls.
+    """Returns items per second: the median over repeated calls, or that of the first call if it is long.
 
     Args:
       call: processes `count` items and waits for the result.
       count: items of one call.
-      seconds: how long to repeat, in s; at least three calls are timed after a first one that is not.
+      seconds: how long to repeat, in s; at least three calls are timed after a first one.
     """
+    began = time.perf_counter()
     call()
+    first = time.perf_counter() - began
+    if first > LONG_CALL_SECONDS:
+        return count / first
     times: list[float] = []
     end = time.perf_counter() + seconds
     while time.perf_counter() < end or len(times) < 3:
@@ -79,8 +91,14 @@ def rate(call: Callable[[], object], count: int, seconds: float) -> float:
 
 
 def measure(name: str, count: int, settings: Settings, function: Callable[..., T], *arguments: object) -> Row:
-    """Compiles and times a program of `count` items; returns one row, with `error` where memory ran out."""
+    """Compiles and times a program of `count` items.
+
+    Returns:
+      One row. It has `error` where memory or time ran out.
+    """
     row: Row = {"what": name, "batch": count}
+    if settings.seconds_left < 0.0:
+        return row | {"error": "not run: out of time"}
     try:
         program = compile_program(function, *arguments)
         row |= {"compile_s": program.seconds, "memory_mib": program.mib}
@@ -94,18 +112,9 @@ def measure(name: str, count: int, settings: Settings, function: Callable[..., T
     return row
 
 
-def sweep(batches: list[int], run: Callable[[int], Row], settings: Settings) -> Iterator[Row]:
-    """Yields a row for each batch size, until memory or time runs out.
-
-    Args:
-      batches: batch sizes, ascending.
-      run: batch size -> row.
-      settings: holds the deadline.
-    """
+def sweep(batches: list[int], run: Callable[[int], Row]) -> Iterator[Row]:
+    """Yields a row for each batch size (ascending) and stops at the first one that has `error`."""
     for batch in batches:
-        if settings.seconds_left < 0.0:
-            yield {"what": "stopped: out of time", "batch": batch}
-            return
         row = run(batch)
         yield row
         if "error" in row:

@@ -10,24 +10,25 @@ import numpy as np
 from gpu_sections.measure import Row, Settings, measure, sweep
 from vsearch_jax.config import IKConfig, PlanningConfig, SceneConfig
 from vsearch_jax.planning import ik, lane_counts, rrt_connect
-from vsearch_jax.robot.arm import Arm, build_arm, camera_pose, forward_kinematics, is_free
+from vsearch_jax.robot import Arm, build_arm, camera_pose, forward_kinematics, is_free
 from vsearch_jax.scene import build_scene
 
 
 def run(settings: Settings) -> Iterator[Row]:
-    """Yields rows of IK, then of RRT-Connect among posts, then of RRT-Connect with other numbers of lanes."""
-    batches = [16] if settings.is_quick else [64, 1024, 16384]
+    """Yields rows of IK, then of RRT-Connect among posts, each also with other numbers of lanes."""
+    is_quick = settings.is_quick
     arm = build_arm(build_scene(SceneConfig()))
-    yield from sweep(batches, lambda batch: _ik(arm, batch, settings), settings)
+    batches = [16] if is_quick else [64, 1024, 16384]
+    yield from sweep(batches, lambda batch: _ik(arm, batch, settings))
     cluttered = build_arm(build_scene(SceneConfig(obstacles="posts")))
-    batches = [8] if settings.is_quick else [64, 512, 4096]
-    yield from sweep(batches, lambda batch: _rrt(cluttered, batch, settings), settings)
-    for num_lanes in [] if settings.is_quick else [64, 512, 2048]:
+    rrt_batches = [8] if is_quick else [64, 512, 4096]
+    yield from sweep(rrt_batches, lambda batch: _rrt(cluttered, batch, settings))
+    for num_lanes in [4] if is_quick else [64, 512, 4096]:
         with lane_counts.override(rrt=num_lanes):
-            yield {"lanes": num_lanes} | _rrt(cluttered, batches[-1], settings)
-    for num_lanes in [] if settings.is_quick else [256, 2048, 16384]:
+            yield {"lanes": num_lanes} | _rrt(cluttered, rrt_batches[-1], settings)
+    for num_lanes in [8] if is_quick else [256, 16384]:
         with lane_counts.override(ik=num_lanes):
-            yield {"lanes": num_lanes} | _ik(arm, 16384, settings)
+            yield {"lanes": num_lanes} | _ik(arm, batches[-1], settings)
 
 
 def random_configurations(arm: Arm, seed: int, count: int) -> np.ndarray:

@@ -28,8 +28,10 @@ def test_a_film_needs_a_new_file(fast: None, capsys: pytest.CaptureFixture[str],
     main(["train", "--preset", "smoke", "--out", run])
     (tmp_path / "old.mp4").write_text("mine")
     before = contents(tmp_path)
-    for out, message in {"old.mp4": "old.mp4 exists; name another file", "a.gif": "a.gif does not end in .mp4"}.items():
-        assert message in user_error(capsys, "video", run, "--out", str(tmp_path / out))
+    remedies = {"old.mp4": "which exists; name another file", "a.gif": "name a file that ends in .mp4"}
+    for name, remedy in remedies.items():
+        message = user_error(capsys, "video", run, "--out", str(tmp_path / name))
+        assert f"--out is {tmp_path / name}" in message and remedy in message
     assert contents(tmp_path) == before
 
 

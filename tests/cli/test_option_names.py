@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from command_line import user_error
 
-from vsearch_jax.cli.commands import Command, Eval, Export, Reach, Train
+from vsearch_jax.cli.commands import Command, Eval, Export, Reach, Train, Video
 from vsearch_jax.cli.option_names import use_option_names
 from vsearch_jax.cli.parse import parse
 from vsearch_jax.config import Config
@@ -37,6 +37,18 @@ from vsearch_jax.runs import loop
         (Reach, "SceneConfig.center_height is -1", "--center-height is -1"),
         (Reach, "SceneConfig.mount_height is -1", "SceneConfig.mount_height is -1"),
         (Export, "SceneConfig.radius is -1", "SceneConfig.radius is -1"),
+        # The short option, if there is one.
+        (Train, "SceneConfig.object is 'cup'; available: truck", "--object is 'cup'; available: truck"),
+        (Train, "EncoderConfig.input is 'x'", "--input is 'x'"),
+        (Reach, "SceneConfig.arm is 'kuka'", "--arm is 'kuka'"),
+        (Video, "add it to the arm's file, or set EnvConfig.motion", "add it to the arm's file, or set --motion"),
+        # Arguments of Python functions.
+        (Train, "`seed` is -1", "--seed is -1"),
+        (Export, "`seed` is -1", "`seed` is -1"),
+        (Export, "`policy` is 7", "--policy is 7"),
+        (Video, "`path` is /a/policy.gif; film it with `episode`", "--out is /a/policy.gif; film it with --episode"),
+        (Reach, "`folder` is /runs/seed, which exists", "--out is /runs/seed, which exists"),
+        (Train, "the site `tcp` and run `vsearch reach`", "the site `tcp` and run `vsearch reach`"),
     ],
 )
 def test_fields_with_an_option_are_replaced(command_type: type[Command], message: str, expected: str) -> None:
@@ -49,7 +61,9 @@ def test_every_field_becomes_an_option_that_train_has() -> None:
         fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else []
         for field in fields:
             option = use_option_names(f"{type(value).__name__}.{field.name}", Train)
-            assert option.startswith(f"--{section.name.replace('_', '-')}."), option
+            is_short = field.name in ("arm", "object", "input")
+            expected = f"{'' if is_short else section.name + '.'}{field.name}"
+            assert option == f"--{expected.replace('_', '-')}"
     value = parse(["train", "--out", "x", use_option_names("CMAESConfig.sigma_deg", Train), "45"])
     assert isinstance(value, Train) and value.config.cma_es.sigma_deg == 45.0
 

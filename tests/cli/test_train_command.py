@@ -19,7 +19,10 @@ from vsearch_jax.runs.metrics_log import STAGES, read_metrics
 
 @pytest.mark.parametrize(
     ("option", "message"),
-    [("--object nothing", "unknown object 'nothing'"), ("--arm {out}/own.xml", "arm file .*own.xml' does not exist")],
+    [
+        ("--object nothing", "--object is 'nothing'; available: bracket"),
+        ("--arm {out}/own.xml", "--arm is .*own.xml', a file that does not exist"),
+    ],
 )
 def test_a_scene_that_cannot_be_built_leaves_the_folder_empty(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, option: str, message: str
@@ -65,7 +68,8 @@ def test_a_folder_with_files_is_not_used(fast: None, capsys: pytest.CaptureFixtu
     out = tmp_path / "run"
     out.mkdir()
     (out / "notes.txt").write_text("mine")
-    assert "exists; name another folder" in user_error(capsys, "train", "--preset", "smoke", "--out", str(out))
+    message = user_error(capsys, "train", "--preset", "smoke", "--out", str(out))
+    assert f"--out is {out}, which exists; name another folder" in message
     assert contents(out) == {"notes.txt": b"mine"}
 
 
@@ -112,7 +116,7 @@ def test_an_unreachable_target_or_band_is_drawn(
 def test_a_seed_out_of_range_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path, seed: int) -> None:
     out = tmp_path / "run"
     message = user_error(capsys, "train", "--preset", "smoke", "--out", str(out), f"--seed={seed}")
-    assert f"seed is {seed}; allowed: 0 to 4294967295" in message
+    assert f"--seed is {seed}; allowed: 0 to 4294967295" in message
     assert not any(out.iterdir())
 
 

@@ -100,6 +100,6 @@ def test_the_interface_describes_the_files_and_they_run_without_the_package(tmp_
 
 def test_a_policy_that_does_not_exist_is_named(tmp_path: Path) -> None:
     config = make_config("rgb")
-    with pytest.raises(ConfigError, match="policy 2 does not exist; allowed: 0 to 1"):
+    with pytest.raises(ConfigError, match="`policy` is 2; allowed: 0 to 1"):
         export(tmp_path, random_state(config), config, policy=2)
     assert not any(tmp_path.iterdir())

@@ -135,7 +135,7 @@ def test_two_episodes_are_two_searches(config: vs.Config, state: TrainState) -> 
 
 
 def test_error_names_an_episode_out_of_range(config: vs.Config, state: TrainState, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--episode is -1; allowed: 0 to 4294967295"):
+    with pytest.raises(ConfigError, match="`episode` is -1; allowed: 0 to 4294967295"):
         make_film(tmp_path / "film.mp4", state, config, "kinematic", -1)
     assert not any(tmp_path.iterdir())
 

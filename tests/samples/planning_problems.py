@@ -29,7 +29,7 @@ class PlanningProblems:
         self.scene = build_scene(SceneConfig(obstacles="posts"))
         self.arm = build_arm(self.scene)
         self.oracle = ContactOracle(self.scene)
-        lower, upper = start_limits(self.arm)
+        lower, upper = (np.asarray(limit) for limit in start_limits(self.arm))
         joints = free_joints(self.scene, lower, upper, seed, 2 * count)
         self.start, self.goal = joints[:count], joints[count:]
         self.goal[:, 7:] = self.start[:, 7:]

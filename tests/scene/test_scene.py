@@ -144,5 +144,5 @@ def test_obstacles_keep_the_positions_of_their_file():
     mujoco.mj_forward(scene.mj_model, data)
     assert len(scene.obstacle_geom_ids) == 5
     np.testing.assert_allclose(data.geom("obstacle/shelf").xpos, [-0.5, 0, 0.45], atol=1e-9)
-    with pytest.raises(SceneError, match="unknown obstacles 'fence'; available: posts"):
+    with pytest.raises(SceneError, match=r"SceneConfig\.obstacles is 'fence'; available: posts"):
         build_scene(SceneConfig(obstacles="fence"))

@@ -24,8 +24,11 @@ def _option(metavar: str, default: str) -> object:
 
 
 _Preset = Annotated[str | None, _option("{" + ",".join(PRESETS) + "}", DEFAULT_PRESET)]
-_Name = Annotated[str | None, _option("NAME|PATH", "see below")]
-_Input = Annotated[Literal["rgb", "depth", "silhouette"] | None, _option("{rgb,depth,silhouette}", "see below")]
+_Object = Annotated[str | None, _option("NAME|PATH", "value of --scene.object")]
+_Arm = Annotated[str | None, _option("NAME|PATH", "value of --scene.arm")]
+_Input = Annotated[
+    Literal["rgb", "depth", "silhouette"] | None, _option("{rgb,depth,silhouette}", "value of --encoder.input")
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,9 +41,9 @@ class Train:
     """Preset that sets the default of each option below."""
     seed: Annotated[int | None, _option("INT", "0")] = None
     """Seed of all random numbers of the run."""
-    object: _Name = None
+    object: _Object = None
     """Short form of --scene.object: a name in xml/objects, or the path of an MJCF or mesh file."""
-    arm: _Name = None
+    arm: _Arm = None
     """Short form of --scene.arm: a name in xml/arm, or the path of an MJCF file."""
     input: _Input = None
     """Short form of --encoder.input."""

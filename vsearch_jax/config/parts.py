@@ -19,7 +19,7 @@ class SceneConfig:
     mesh_scale: float = 1.0
     """Length of one unit of the object's mesh file, in m. For a file in millimetres it is 0.001."""
     is_mesh_recentred: bool = True
-    """Whether the object's mesh is moved over the origin and onto the table. Without it the file's position counts."""
+    """Whether the object's mesh is moved over the origin and onto the table. If not, it keeps the file's position."""
     obstacles: str | None = None
     """Name of obstacles in xml/obstacles, or path of an MJCF file in world coordinates. None adds no obstacles."""
     mount_height: float = 1.355
@@ -52,7 +52,7 @@ class EncoderConfig:
     channels: tuple[int, ...] = (64, 128, 128)
     """Number of filters of each convolution. All but the first halve height and width. The decoder mirrors them."""
     stem_stride: int = 4
-    """Stride of the first convolution: 2, or 4 with an 8x8 kernel. 4 costs a third of two convolutions of stride 2."""
+    """Stride of the first convolution: 2, or 4 (8x8 kernel). Stride 4 takes 1/3 of the time of two of stride 2."""
     kernel_size: int = 3
     """Height and width of the kernels of stride-2 convolutions, in pixels."""
     decoder_size: int = 64
@@ -138,7 +138,7 @@ class EvaluationConfig:
     num_episodes: int = 1000
     """Number of episodes of each policy. Initial view and target of an episode are random."""
     patience: int = 7
-    """Number of steps after which a policy that makes no progress is helped. Near the target it is helped at once."""
+    """Number of steps before a local search helps a stalled policy. Near the target, one step of stalling is enough."""
     batch_size: int = 125
     """Number of episodes that run side by side."""
 

@@ -14,7 +14,7 @@ class RandomSearchConfig:
     num_samples: int = 10
     """Number of views in an epoch."""
     k: float = 1.5
-    """Standard deviation of the samples for each unit of missing cosine, in rad."""
+    """Factor k. The standard deviation of the samples is k (1 - best cosine so far), in rad."""
     max_epochs: int = 30
     """Number of epochs after which the search gives up."""
 
@@ -67,7 +67,7 @@ class SACConfig:
     tau: float = 0.02
     """Rate of the target critic's moving average."""
     relabel_fraction: float = 0.8
-    """Fraction of a batch with a new target. Two thirds get a random view, one third the view that the step reached."""
+    """Fraction of a batch that gets a new target. 2/3 of it get a random view, 1/3 the view that the step reached."""
 
     def __post_init__(self) -> None:
         require_positive(

@@ -27,7 +27,7 @@ class Config:
     sac: SACConfig = field(default_factory=SACConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     num_chunks: int = 1
-    """Number of equal chunks of a run. Each call of `train` runs one chunk. The last chunk may be shorter."""
+    """Number of equal chunks of a run. `vsearch train` saves after each chunk. The last chunk may be shorter."""
 
     def __post_init__(self) -> None:
         reduction = self.encoder.stem_stride * 2 ** (len(self.encoder.channels) - 1)
@@ -66,7 +66,7 @@ class Config:
           ConfigError: no preset has that name.
         """
         if name not in PRESETS:
-            raise ConfigError(f"unknown preset {name!r}; allowed: {', '.join(PRESETS)}")
+            raise ConfigError(f"`preset` is {name!r}; allowed: {', '.join(PRESETS)}")
         return PRESETS[name]
 
     def to_dict(self) -> dict[str, object]:
@@ -112,6 +112,7 @@ PRESETS: dict[str, Config] = {
     "gpu": Config(
         encoder=EncoderConfig(num_updates=12_000, batch_size=256, decoder_size=128, pool_size=4096),
         sac=SACConfig(num_seeds=10, num_environment_steps=10_240),
+        evaluation=EvaluationConfig(batch_size=500),
         num_chunks=79,
     ),
 }

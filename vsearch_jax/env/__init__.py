@@ -1,6 +1,14 @@
 """The view-search task (thesis 4.3) as a `brax.envs.Env`."""
 
-from vsearch_jax.env.episode import UnreachableError, build_obs, check_band, episode_of, obs_of, pose_error
+from vsearch_jax.env.episode import (
+    UnreachableError,
+    build_obs,
+    check_band,
+    episode_of,
+    obs_of,
+    pose_error,
+    step_reward,
+)
 from vsearch_jax.env.examples import encoder_example
 from vsearch_jax.env.task import ViewSearchEnv
 
@@ -13,4 +21,5 @@ __all__ = [
     "episode_of",
     "obs_of",
     "pose_error",
+    "step_reward",
 ]

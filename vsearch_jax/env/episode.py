@@ -49,7 +49,7 @@ def check_band(reach: ReachabilityMap, config: Config) -> None:
         raise UnreachableError(
             f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
             f"at every azimuth around object {config.scene.object!r}; run `vsearch reach`: it draws the views that the "
-            "arm reaches and proposes a mount height (--scene.mount-height)",
+            "arm reaches and proposes a mount height (SceneConfig.mount_height)",
             reach,
         )
 
@@ -107,9 +107,7 @@ def next_state(state: State, observation: Observation, motion: Motion, config: E
     is_reachable = motion.is_found
     observation = tree_where(is_reachable, observation, episode.observation)
     similarity = cosine_similarity(observation.code, episode.target.code)
-    is_found = is_reachable & (similarity >= config.threshold)
-    reward = jnp.where(is_found, config.success_reward, similarity - 1.0)
-    reward = jnp.where(is_reachable, reward, config.unreachable_reward)
+    reward, is_found = step_reward(similarity, is_reachable, config)
     num_steps = episode.num_steps + 1
     terminated = is_found.astype(jnp.float32)
     truncated = (num_steps >= config.episode_length) & ~is_found
@@ -128,6 +126,22 @@ def next_state(state: State, observation: Observation, motion: Motion, config: E
         metrics=metrics,
         info=info,
     )
+
+
+def step_reward(similarity: Array, is_reachable: Array, config: EnvConfig) -> tuple[Array, Array]:
+    """Computes the reward of a step, and whether the step finds the target. The arrays may have leading batch axes.
+
+    Args:
+      similarity: f32[], cosine of the code after the step and the target's code.
+      is_reachable: bool[], the arm reaches the view of the step.
+      config: threshold and rewards.
+
+    Returns:
+      Reward f32[]; and bool[], the step is reachable and its similarity meets the threshold.
+    """
+    is_found = is_reachable & (similarity >= config.threshold)
+    reward = jnp.where(is_found, config.success_reward, similarity - 1.0)
+    return jnp.where(is_reachable, reward, config.unreachable_reward), is_found
 
 
 def commanded_view(view: View, action: Array, action_scale_deg: float) -> View:

@@ -79,8 +79,8 @@ def check_target(reach: ReachabilityMap, config: Config) -> None:
     if not low - 1e-3 <= elevation <= high + 1e-3:
         raise UnreachableError(
             f"EvaluationConfig.target_elevation_deg is {elevation:g}, which the arm cannot reach at every azimuth; "
-            f"allowed with this arm, mount and object: {low:.1f} to {high:.1f}. Set --evaluation.target-elevation-deg, "
-            "or --scene.mount-height",
+            f"allowed with this arm, mount and object: {low:.1f} to {high:.1f}. Set it in this "
+            "range, or set another SceneConfig.mount_height",
             reach,
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from brax.envs.base import State
 from jax import Array
 
 from vsearch_jax.config import Config
-from vsearch_jax.env import ViewSearchEnv, episode_of
+from vsearch_jax.env import ViewSearchEnv, episode_of, obs_of
 from vsearch_jax.evaluation.views import ViewRequest, observe_request, protocol_target
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search import sac
@@ -78,8 +78,7 @@ def mean_action(actor: nnx.State, state: State, config: Config) -> Array:
     Returns:
       Action f32[2] in [-1, 1]: change of azimuth and elevation in units of `env.action_scale_deg`.
     """
-    obs = cast("Array", state.obs)  # brax allows a dictionary too; ViewSearchEnv gives one array
-    return sac.act(None, actor, obs, config.sac)
+    return sac.act(None, actor, obs_of(state), config.sac)
 
 
 def opposite_start(env: ViewSearchEnv, key: Array) -> ViewRequest:

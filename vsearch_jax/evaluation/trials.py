@@ -16,6 +16,7 @@ from vsearch_jax.search import Method, SearchArgs
 from vsearch_jax.search.common import is_running, taken_images, to_result
 from vsearch_jax.types import Camera, Observation, SearchResult, View
 from vsearch_jax.xla.batching import map_in_batches
+from vsearch_jax.xla.tree import tree_where
 
 
 class TrialResults(NamedTuple):
@@ -155,7 +156,8 @@ def _run_generation(bench: _Bench, key: Array, args: SearchArgs, trial: _Trial) 
     is_moved = motions.is_found & taken_images(scores, args.threshold) & is_requested
     qpos, costs = _add_motion_costs(bench.env, trial, observations.qpos, motions._replace(is_found=is_moved))
     states, best = jax.lax.switch(bench.number, [functools.partial(tell, i) for i in numbers], states, views, scores)
-    camera = jax.tree.map(lambda new, old: jnp.where(best >= 0, new[best], old), observations.camera, trial.camera)
+    best_camera = jax.tree.map(lambda x: x[best], observations.camera)
+    camera = tree_where(best >= 0, best_camera, trial.camera)
     return _Trial(states, camera, qpos, costs)
 
 

@@ -98,7 +98,7 @@ def export(folder: Path, state: TrainState, config: Config, policy: int = 0) -> 
     """
     num_policies = config.sac.num_seeds
     if not 0 <= policy < num_policies:
-        raise ConfigError(f"policy {policy} does not exist; allowed: 0 to {num_policies - 1}")
+        raise ConfigError(f"`policy` is {policy}; allowed: 0 to {num_policies - 1}")
     actor = jax.tree.map(lambda x: x[policy], state.sac.actor)
     encode = functools.partial(encode_picture, encoder=state.encoder, config=config)
     act = functools.partial(policy_step, encoder=state.encoder, actor=actor, config=config)

@@ -76,7 +76,7 @@ def make_film(
         full disk.
     """
     if episode is not None and not 0 <= episode <= MAX_SEED:
-        raise ConfigError(f"--episode is {episode}; allowed: 0 to {MAX_SEED}")
+        raise ConfigError(f"`episode` is {episode}; allowed: 0 to {MAX_SEED}")
     find_ffmpeg()  # before the search, so that a missing ffmpeg is reported at once
     config = dataclasses.replace(config, env=dataclasses.replace(config.env, reachable="path", motion=motion))
     key = None if episode is None else jax.random.key(episode)
@@ -85,7 +85,7 @@ def make_film(
     if longest > MAX_SECONDS:
         raise FilmError(
             f"a motion takes {longest:.0f} s, but a film shows at most {MAX_SECONDS} s of each motion; film another "
-            "search with --episode, or raise the speed limits (`user` of the joints) in the arm's file"
+            "search with `episode`, or raise the speed limits (`user` of the joints) in the arm's file"
         )
     plan = _plan_frames(search)
     frames = _draw_frames(state, search, plan, config, height)

@@ -56,7 +56,7 @@ def check_drive(scene: Scene, arm: Arm) -> None:
     if missing:
         raise SceneError(
             f"joint {missing} has no position actuator, but EnvConfig.motion 'dynamic' needs one; add "
-            "<position joint=... kp=... kv=.../> to the arm's file, or set motion to 'kinematic'"
+            "<position joint=... kp=... kv=.../> to the arm's file, or set EnvConfig.motion to 'kinematic'"
         )
 
 
@@ -65,7 +65,7 @@ def execute(arm: Arm, model: mjx.Model, trajectory: Trajectory, config: Planning
 
     The commands lead the path by the lag of the actuators' damping, so a constant speed is followed without error.
     Contacts are not simulated, since planning has excluded them. If the trajectory lasts 0 s, the arm does not move.
-    Under `vmap` the motions run one after another, because on CPU MJX is slow in a batch (see `kinematics`).
+    Under `vmap` the motions run one after another, because on CPU MJX is slow in a batch (see `robot.kinematics`).
 
     Args:
       arm: the arm.

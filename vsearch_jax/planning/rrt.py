@@ -42,7 +42,7 @@ def rrt_connect(arm: Arm, key: Array, start: Array, goal: Array, config: Plannin
 
     The straight joint path is tried first. If it is blocked, two trees grow from start and goal until they meet
     (Kuffner and LaValle 2000), and shortcuts shorten the path through them. The path is proven free of contact for the
-    model's geometry (see `edges`).
+    model's geometry (see `planning.edges`).
 
     Under `vmap` the problems share a fixed number of lanes: each lane solves one problem after another, so no problem
     waits for the slowest (see `xla.lane_pool` and `planning.lane_counts`). `vmap` over the arm raises

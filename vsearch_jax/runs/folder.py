@@ -50,7 +50,7 @@ def make_new_folder(folder: Path) -> None:
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         is_run = (folder / CONFIG).is_file()
         hint = f", or continue the run in it: vsearch train --out {folder} --resume" if is_run else ""
-        raise RunError(f"{folder} exists; name another folder with --out{hint}")
+        raise RunError(f"`folder` is {folder}, which exists; name another folder{hint}")
     folder.mkdir(parents=True, exist_ok=True)
 
 
@@ -65,9 +65,9 @@ def check_new_file(path: Path, suffix: str) -> None:
       RunError: something exists at `path`, or the name does not end in `suffix`.
     """
     if path.suffix.lower() != suffix:
-        raise RunError(f"{path} does not end in {suffix}; name a file that ends in {suffix} with --out")
+        raise RunError(f"`path` is {path}; name a file that ends in {suffix}")
     if path.exists():
-        raise RunError(f"{path} exists; name another file with --out")
+        raise RunError(f"`path` is {path}, which exists; name another file")
     path.parent.mkdir(parents=True, exist_ok=True)
 
 

@@ -55,7 +55,7 @@ def start_run(run: Path, config: Config, seed: int) -> TrainState:
       OSError: the disk is full or not writable.
     """
     if not 0 <= seed <= MAX_SEED:
-        raise ConfigError(f"seed is {seed}; allowed: 0 to {MAX_SEED}")
+        raise ConfigError(f"`seed` is {seed}; allowed: 0 to {MAX_SEED}")
     with new_run_folder(run):
         state = call_interruptibly(init, jax.random.key(seed), config)
         # Only the evaluation needs the target. Checked here, the error comes before the training, not after it.

@@ -56,13 +56,13 @@ def find_file(part: str, name: str) -> Path:
     if path.suffix or path.parent != Path("."):
         if not path.is_file():
             raise SceneError(
-                f"{part} file {name!r} does not exist; "
+                f"SceneConfig.{part} is {name!r}, a file that does not exist; "
                 f"give the path of a file, or one of these names: {', '.join(available(folder))}"
             )
         return path.resolve()
     if name not in available(folder):
         raise SceneError(
-            f"unknown {part} {name!r}; available: {', '.join(available(folder))}; "
+            f"SceneConfig.{part} is {name!r}; available: {', '.join(available(folder))}; "
             "give one of these names, or the path of a file"
         )
     return xml_folder() / folder / f"{name}.xml"

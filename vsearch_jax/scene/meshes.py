@@ -109,12 +109,12 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, max_size: float) -> Mesh
     if size > max_size:
         raise MeshError(
             f"it is {size:.3g} m long, but the maximum is {max_size:.3g} m; "
-            "if its unit is millimetres, set SceneConfig.mesh_scale (--scene.mesh-scale) to 0.001"
+            "if its unit is millimetres, set SceneConfig.mesh_scale to 0.001"
         )
     if size < _MIN_SIZE:
         raise MeshError(
             f"it is {size:.3g} m long, but the minimum is {_MIN_SIZE} m; "
-            "set SceneConfig.mesh_scale (--scene.mesh-scale) to the length of its unit in metres"
+            "set SceneConfig.mesh_scale to the length of its unit in metres"
         )
     return report
 

@@ -88,7 +88,7 @@ def _with_vmap_rule(
     def rule(axis_size: int, in_batched: tuple[Shared, Items], shared: Shared, items: Items) -> tuple[Results, Results]:
         if any(jax.tree.leaves(in_batched[0])):
             raise NotImplementedError(
-                "vmap over the first argument (an arm, for example) is not supported; call the function once for each"
+                "vmap over the first argument is not supported; call the function once for each value of it"
             )
         repeated = jax.tree.map(
             lambda leaf, is_mapped: leaf if is_mapped else jnp.broadcast_to(leaf[None], (axis_size, *leaf.shape)),

@@ -6,6 +6,8 @@ not prevent this. A loop does: its operands are written to memory, even if the l
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import TypeVar
 
 import jax
@@ -24,25 +26,54 @@ def _change_all(state: tuple[Array, Array, Tree]) -> tuple[Array, Array, Tree]:
     return state[0] + 1, state[1], jax.tree.map(lambda leaf: leaf + jnp.ones((), leaf.dtype), state[2])
 
 
-@jax.custom_jvp
-def materialize(tree: Tree, zero: Array) -> Tree:
-    """Returns `tree` unchanged, but forces XLA to compute its arrays once and to write them to memory.
+# Replaces the choice by platform; see `override_materialize`.
+_overridden: list[bool] = []
 
-    Otherwise XLA on CPU may compute them again for each use.
+
+def _is_enabled() -> bool:
+    """Returns whether `materialize` does anything. Measured on CPU only, so other platforms leave fusion to XLA."""
+    return _overridden[-1] if _overridden else jax.default_backend() == "cpu"
+
+
+@contextlib.contextmanager
+def override_materialize(is_enabled: bool) -> Iterator[None]:
+    """Switches `materialize` on or off in a `with` block, for measurements; read at trace time.
+
+    JAX does not know that a traced function depends on it, so its caches are cleared at both ends of the block.
+
+    Args:
+      is_enabled: whether `materialize` forces its values to memory.
+    """
+    _overridden.append(is_enabled)
+    jax.clear_caches()
+    try:
+        yield
+    finally:
+        _overridden.pop()
+        jax.clear_caches()
+
+
+def materialize(tree: Tree, zero: Array) -> Tree:
+    """Returns `tree` unchanged. On CPU it also forces XLA to write the tree to memory once.
 
     Args:
       tree: pytree of numeric arrays.
       zero: i32[], 0 at run time. Must not be a compile-time constant; see `runtime_zero`.
 
     Returns:
-      `tree`. Derivatives pass through unchanged.
+      The same values. Derivatives pass through.
     """
+    return _materialize(tree, zero) if _is_enabled() else tree
+
+
+@jax.custom_jvp
+def _materialize(tree: Tree, zero: Array) -> Tree:
     return jax.lax.while_loop(_has_next, _change_all, (jnp.zeros_like(zero), zero, tree))[2]
 
 
-@materialize.defjvp
+@_materialize.defjvp
 def _materialize_jvp(primals: tuple[Tree, Array], tangents: tuple[Tree, Array]) -> tuple[Tree, Tree]:
-    return materialize(*primals), tangents[0]
+    return _materialize(*primals), tangents[0]
 
 
 def runtime_zero(values: Array) -> Array:

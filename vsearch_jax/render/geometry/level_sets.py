@@ -77,7 +77,7 @@ def level(slot: Array, starts: tuple[tuple[int, int], ...], size: Vector, point:
 
     Args:
       slot: i32[H, W], row of each pixel's geom in the scene. Rows are sorted by geom type.
-      starts: (mjtGeom, first row) of each geom type in the scene, sorted by row; see `trace.type_starts`. Static.
+      starts: (mjtGeom, first row) of each geom type in the scene, sorted by row; from `render.trace.type_starts`.
       size: three f32[H, W] m, MuJoCo's `geom_size` of each pixel's geom.
       point: three f32[H, W] m, a point on or near the surface of each pixel's geom, in the frame of that geom.
 

@@ -5,9 +5,9 @@ face of each ray. The algorithm has three steps:
 
 1. `_bounding_rectangles` projects the corners of every face, and returns the rectangle of pixels that holds the face.
    Faces outside the image and culled faces get an empty rectangle.
-2. All pairs (face, pixel of its rectangle) are numbered; see `pairs.py`. A loop takes a batch of consecutive numbers at
-   a time, and recovers from each number the face (a scatter of the faces' first numbers, then a running maximum) and
-   the pixel (the pair's rank within its face).
+2. All pairs (face, pixel of its rectangle) are numbered; see `render.geometry.pairs`. A loop takes a batch of
+   consecutive numbers at a time, and recovers from each number the face (a scatter of the faces' first numbers, then a
+   running maximum) and the pixel (the pair's rank within its face).
 3. For each pair, the ray through the pixel's centre is tested against the face. The nearest hit of each pixel is kept
    (a depth buffer, by a scatter of minima).
 

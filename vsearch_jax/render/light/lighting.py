@@ -1,7 +1,8 @@
 """The lights of a scene at each pixel: poses in the camera's frame, shadows, and the terms of the light model.
 
-Shadows have two sources. Shadows of primitives come from exact shadow rays (`trace.is_lit`). Shadows of meshes and
-height fields come from shadow maps (`shadow_map`). A pixel is lit if both say so. Shadows have no derivative.
+Shadows have two sources. Shadows of primitives come from exact shadow rays (`render.trace.is_lit`). Shadows of meshes
+and height fields come from shadow maps (`render.light.shadow_map`). A pixel is lit if both say so. Shadows have no
+derivative.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from vsearch_jax.render.geometry.triangles import TRIANGLE_TYPES
 # MESH: texture coordinates of the mesh's vertices.
 # PLANAR: x and y of the point (for meshes without texture coordinates and height fields).
 # CUBE: direction of the point, for a cube map.
-# PRIMITIVE: MuJoCo's parametrisation of the primitive; see `lookup.py`.
+# PRIMITIVE: MuJoCo's parametrisation of the primitive; see `render.texture.lookup`.
 NO_TEXTURE, MESH, PLANAR, CUBE, PRIMITIVE = range(5)
 
 

@@ -60,7 +60,7 @@ def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
 
     Args:
       pairs: the pairs of geoms that must not touch, and the C capsules of these pairs.
-      rotations: f32[J + 1, 3, 3], frame to world, for the world and the J joints, from `kinematics.frames`.
+      rotations: f32[J + 1, 3, 3], frame to world, for the world and the J joints, from `robot.kinematics.frames`.
       positions: f32[J + 1, 3] m in world, origins of these frames. Both arrays may have a batch axis at the end.
 
     Returns:

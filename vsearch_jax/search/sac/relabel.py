@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.config import EnvConfig, SACConfig
+from vsearch_jax.env import step_reward
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.types import Transition
 
@@ -46,12 +47,11 @@ def relabel(
     target = jnp.where(is_own[:, None], next_code, jnp.where(is_new[:, None], candidate, target))
 
     similarity = cosine_similarity(next_code, target)
-    is_found = is_reachable & (similarity >= env_config.threshold)
-    reward = jnp.where(is_found, env_config.success_reward, similarity - 1.0)
+    reward, is_found = step_reward(similarity, is_reachable, env_config)
     return transitions._replace(
         obs=_replace_target(transitions.obs, target),
         next_obs=_replace_target(transitions.next_obs, target),
-        reward=jnp.where(is_reachable, reward, env_config.unreachable_reward),
+        reward=reward,
         terminated=is_found.astype(transitions.terminated.dtype),
     )
 
