@@ -258,10 +258,12 @@ def encode(encoder: EncoderState, x: Array, config: Config) -> Array:
 
 
 def network_input(image: Image, object_geom_ids: Array | tuple[int, ...], config: Config) -> Array:
-    """Converts a rendered image to the encoder's input image. `config.encoder.input` says of which kind.
+    """Converts a rendered image to the encoder's input image, of the kind that `config.encoder.input` names.
 
-    rgb: the image's colours. silhouette: 1 on the object, 0 elsewhere. depth: d / radius - 1/2, clipped to [0, 1], so
-    the range is half a radius of the view sphere before and behind its centre. A miss is 1.
+    - "rgb": the colours of the image.
+    - "silhouette": 1 in pixels that show the object, else 0.
+    - "depth": depth along the optical axis, scaled linearly and clipped to [0, 1]. 0 is half the camera's distance from
+      the object, 1 is one and a half times that distance. A pixel that shows nothing is 1.
 
     Args:
       image: rendered image of H x W pixels.

@@ -82,14 +82,17 @@ def mean_action(actor: nnx.State, state: State, config: Config) -> Array:
 
 
 def opposite_start(env: ViewSearchEnv, key: Array) -> ViewRequest:
-    """Chooses the two views of a recorded search: an initial view behind the object, and the evaluation's target view.
+    """Chooses the initial view and the target view of a recorded search.
+
+    The target is that of the evaluation. The initial view lies on the opposite side of the object, 165 degrees of
+    azimuth away, in the middle of the reachable elevations.
 
     Args:
       env: the task.
-      key: PRNG key of the run (`TrainState.key`); the preferred joint values come from it.
+      key: PRNG key of the run (`TrainState.key`). Random joint values are drawn from it, near which IK solves the views.
 
     Returns:
-      Requests for the images of exactly these views, leading axis 2: initial view, target view.
+      Two ViewRequests (leading axis 2), the initial view first. Neither view may be replaced by a nearby one.
     """
     target = protocol_target(env.config)
     initial = View(wrap_angle(target.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))

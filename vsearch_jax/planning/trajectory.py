@@ -131,13 +131,14 @@ def check_speeds(arm: Arm) -> None:
 def straight_duration(arm: Arm, start: Array, goal: Array, config: PlanningConfig) -> Array:
     """Returns f32[] s, the shortest time for the straight joint path from `start` to `goal`, from rest to rest.
 
-    It equals the time of `time_path`. It is NaN if a joint that moves the camera has no speed limit.
+    Each joint needs `config.acceleration_time` to reach its full speed. `time_path` gives a straight path the same
+    time. The result is NaN if any joint that moves the camera has no speed limit.
 
     Args:
       arm: the arm, with the speed limits.
       start: f32[nq] rad or m, joint values at the start.
       goal: f32[nq] rad or m, joint values at the end.
-      config: the acceleration time.
+      config: PlanningConfig; only `acceleration_time` is used.
     """
     address = arm.chain.address
     at_full_speed = jnp.max(jnp.abs(goal - start)[address] / arm.speed[address])

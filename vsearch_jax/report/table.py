@@ -70,7 +70,14 @@ class Cell(NamedTuple):
 
 
 def table_rows(results: Results) -> list[tuple[str, list[Cell]]]:
-    """Formats the table of results: for each measure a label, and one cell for each searcher, as in `SEARCHERS`."""
+    """Formats the rows of the results table, one for each metric.
+
+    Args:
+      results: what `results.json` holds.
+
+    Returns:
+      For each metric its label and its cells: one cell for each search method, in the order of `SEARCHERS`.
+    """
     return [
         (measure.label, [_cell(measure, results[name], results["thesis"][name]) for name in SEARCHERS])
         for measure in MEASURES

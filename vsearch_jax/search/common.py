@@ -150,14 +150,14 @@ def taken_images(scores: Array, threshold: Array) -> Array:
 
 
 def add_generation(record: Record, views: View, scores: Array, threshold: Array) -> Record:
-    """Adds one generation (N views that the searcher asked for at once) and its scores to the record.
+    """Updates the record of a search with one generation: N views that the searcher asked for, and their scores.
 
-    The images are taken one by one. The search ends with the first image that meets the threshold. The images after it
-    are not taken: they are not counted and cannot become the best.
+    The record counts as if the arm had visited the views in order and stopped at the first score >= threshold. Later
+    views are not counted and cannot become the best view. Unreachable views before it are counted.
 
     Args:
-      record: what the search found before the generation.
-      views: the views of the generation, f32[N] rad.
+      record: the record before the generation; the search must not have ended.
+      views: View whose azimuth and elevation are f32[N] rad each.
       scores: f32[N], scores of `views`; -inf where the arm cannot reach the view.
       threshold: f32[], score at which the search ends.
 

@@ -85,12 +85,12 @@ def apply_network(network: type[Network], sizes: tuple[int, ...], params: nnx.St
 
     Args:
       network: Actor or Critic.
-      sizes: number of units of each layer, from the input to the output.
+      sizes: numbers of units: of the whole input, of each hidden layer, of the output.
       params: parameters from `init_network` with the same `network` and `sizes`.
-      *inputs: f32[..., size] each: the obs for an Actor; the obs and the action for a Critic.
+      *inputs: the obs f32[..., O] for an Actor; the obs and the action f32[..., A] for a Critic.
 
     Returns:
-      Distribution parameters f32[..., sizes[-1]] from an Actor, values f32[...] from a Critic.
+      An Actor's distribution parameters f32[..., sizes[-1]], or a Critic's values f32[...] (its last size is 1).
     """
     return nnx.merge(_graphdef(network, sizes), params)(*inputs)
 
