@@ -89,7 +89,7 @@ def opposite_start(env: ViewSearchEnv, key: Array) -> ViewRequest:
 
     Args:
       env: the task.
-      key: PRNG key of the run (`TrainState.key`). Random joint values are drawn from it, near which IK solves the views.
+      key: PRNG key of the run (`TrainState.key`). IK starts from random joint values drawn from it.
 
     Returns:
       Two ViewRequests (leading axis 2), the initial view first. Neither view may be replaced by a nearby one.
