@@ -90,7 +90,8 @@ def test_a_run_of_the_script_is_one_of_the_package(
     script, folder = load("train/train.py"), tmp_path / "by-script"
     monkeypatch.setattr(script, "record_search", fast_run.record_search)
     script.train(folder, CONFIG, SEED)
-    np.testing.assert_array_equal(loop.resume_run(folder, CONFIG).weights, loop.resume_run(run, CONFIG).weights)
+    states: list[Any] = [loop.resume_run(path, CONFIG) for path in (folder, run)]
+    np.testing.assert_array_equal(states[0].weights, states[1].weights)
     for of_script, of_package in zip(runs.read_metrics(folder), runs.read_metrics(run), strict=True):
         assert of_script | {"seconds": 0.0} == of_package | {"seconds": 0.0}
 
