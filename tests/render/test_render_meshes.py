@@ -141,7 +141,8 @@ def test_shadows_of_meshes_equal_mj_ray_towards_the_light(light: mjtLightType) -
         is_clear = (ids >= 0) & ~is_face & ~on_outline(ids) & ~on_outline(is_reached)
         errors.append(np.mean((is_white != is_reached)[is_clear]))
     # A cell of the shadow map is about as large as a pixel, so a few pixels near shadow edges may differ.
-    assert np.max(errors) < 5e-3
+    assert np.max(errors[:-1]) < 2e-3
+    assert errors[-1] < 3e-3
     assert np.mean(errors) < 1e-3
 
 
