@@ -130,14 +130,14 @@ def _version(name: str) -> str | None:
 def run_sections(report: Report, names: list[str], settings: Settings) -> None:
     """Runs the named sections; each may use a share of the time that is left when it begins."""
     trained: list[tuple[TrainState, vs.Config]] = []
-    reference = parity.start_reference(report.folder) if "parity" in names else None
+    reference = parity.start_reference(report.folder, settings.is_quick) if "parity" in names else None
     sections: dict[str, Callable[[], Iterable[Row]]] = {
         "parity": lambda: parity.run(settings.share(0.3), reference) if reference else [],
         "train": lambda: learning.train("gpu", settings.share(0.4), trained),
         "evaluate": lambda: learning.evaluate(settings.share(0.2), trained),
         "renderer": lambda: rendering.run(settings.share(0.4)),
         "planning": lambda: planning.run(settings.share(0.5)),
-        "rates": lambda: learning.rates(settings.share(0.6)),
+        "rates": lambda: learning.rates(settings.share(0.6), trained),
         "thesis": lambda: learning.train("thesis", settings, []),
     }
     for name in names:

@@ -19,17 +19,21 @@ from vsearch_jax.training import encoder_iteration
 from vsearch_jax.types import TrainState, Transition
 
 
-def choose_config(name: str, settings: Settings) -> vs.Config:
-    """Returns a preset. A quick run takes `smoke` with silhouettes, which compile sooner."""
-    if not settings.is_quick:
-        return vs.Config.preset(name)
+def quick_config() -> vs.Config:
+    """Returns the config of all sections of a quick run: `smoke` with silhouettes, which compile sooner."""
     smoke = vs.Config.preset("smoke")
     return dataclasses.replace(smoke, encoder=dataclasses.replace(smoke.encoder, input="silhouette"))
 
 
-def rates(settings: Settings) -> Iterator[Row]:
-    """Yields rows of encoder updates, environment steps and SAC updates per second against batch size."""
-    env = ViewSearchEnv(choose_config("gpu", settings))
+def rates(settings: Settings, trained: list[tuple[TrainState, vs.Config]]) -> Iterator[Row]:
+    """Yields rows of encoder updates, environment steps and SAC updates per second against batch size.
+
+    Args:
+      settings: sizes and deadline.
+      trained: from `train`; its first state has the encoder and the reachability map. Empty: both are computed.
+    """
+    state, config = trained[0] if trained else (None, quick_config() if settings.is_quick else vs.Config.preset("gpu"))
+    env = ViewSearchEnv(config, state.encoder, state.reach) if state else ViewSearchEnv(config)
     batches = [8] if settings.is_quick else [64, 256, 1024, 4096]
     yield from sweep(batches, lambda batch: _encoder_updates(env, batch, settings))
     batches = [2] if settings.is_quick else [16, 160, 2048]
@@ -73,7 +77,7 @@ def train(name: str, settings: Settings, trained: list[tuple[TrainState, vs.Conf
       settings: holds the deadline; at least one chunk is trained.
       trained: receives the last state and the config.
     """
-    config = choose_config(name, settings)
+    config = quick_config() if settings.is_quick else vs.Config.preset(name)
     began = time.perf_counter()
     state = jax.block_until_ready(vs.init(jax.random.key(0), config))
     yield {"what": f"{name}: init, compiled and run", "seconds": time.perf_counter() - began}
@@ -98,7 +102,10 @@ def train(name: str, settings: Settings, trained: list[tuple[TrainState, vs.Conf
 
 
 def evaluate(settings: Settings, trained: list[tuple[TrainState, vs.Config]]) -> Iterator[Row]:
-    """Yields the evaluation's time, with and without compilation, each searcher's success, and another batch size."""
+    """Yields the evaluation's time, with and without compilation, and each searcher's success.
+
+    Another batch size follows, but not in a quick run: its compilation alone takes a third of the time.
+    """
     if not trained:
         yield {"what": "not run: nothing was trained"}
         return
@@ -112,7 +119,7 @@ def evaluate(settings: Settings, trained: list[tuple[TrainState, vs.Config]]) ->
         success, images = np.mean(arrays["is_success"]), np.mean(arrays["evaluations"])
         row: Row = {"what": name, "success_rate": float(success), "evaluations_mean": float(images)}
         yield row | {"is_training_finished": is_finished}
-    if settings.seconds_left > 0.0:
+    if settings.seconds_left > 0.0 and not settings.is_quick:
         settings_ = dataclasses.replace(config.evaluation, batch_size=config.evaluation.num_episodes // 8)
         other = dataclasses.replace(config, evaluation=settings_)
         jax.block_until_ready(vs.evaluate(state, other))

@@ -1,9 +1,9 @@
 """Compares what the accelerator computes with what a CPU computes.
 
 `compute` runs on the accelerator, and in a process of its own on the CPU:
-`JAX_PLATFORMS=cpu python eval/gpu_sections/parity.py reference.npz`. On the accelerator, images and IK are computed
-with JAX's default precision of matrix products and with the highest. A GPU's default may round factors to 10 bits
-(TF32).
+`JAX_PLATFORMS=cpu python eval/gpu_sections/parity.py reference.npz [--quick]`. On the accelerator, images and IK are
+computed with JAX's default precision of matrix products and with the highest. A GPU's default may round factors to 10
+bits (TF32).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import numpy as np
 
 import vsearch_jax as vs
 from benchmarks.render_peers import FOVY, mesh_case, project_case
+from gpu_sections.learning import quick_config
 from gpu_sections.measure import Row, Settings
 from gpu_sections.planning import random_configurations
 from vsearch_jax import render
@@ -46,13 +47,13 @@ MAX_SOLVED_DIFFERENCE = 0.02
 MAX_POSITION_ERROR = 1.1e-3
 """In m, of solved poses, by C MuJoCo's kinematics; IK's own tolerance is 1e-3."""
 MAX_LOSS_DIFFERENCE = 0.05
-"""Relative, of the encoder's loss over all updates of the preset `smoke`."""
+"""Relative, of the encoder's loss over all updates of the small run."""
 MAX_REWARD_DIFFERENCE = 0.1
-"""Mean absolute difference over the policy iterations of the preset `smoke`."""
+"""Mean absolute difference over the policy iterations of the small run."""
 
 
-def compute(precisions: Sequence[str] = ("default",)) -> dict[str, np.ndarray]:
-    """Returns images, IK solutions and metrics of training, by name."""
+def compute(config: vs.Config, precisions: Sequence[str] = ("default",)) -> dict[str, np.ndarray]:
+    """Returns images, IK solutions and metrics of a whole run of `config`, by name."""
     arrays: dict[str, np.ndarray] = {}
     for precision in precisions:
         with contextlib.nullcontext() if precision == "default" else jax.default_matmul_precision(precision):
@@ -60,7 +61,7 @@ def compute(precisions: Sequence[str] = ("default",)) -> dict[str, np.ndarray]:
                 for plane, values in zip(("rgb", "depth", "geom_id"), _images(scene), strict=True):
                     arrays[f"{scene}/{precision}/{plane}"] = values
             arrays[f"ik/{precision}/is_solved"], arrays[f"ik/{precision}/position_error"] = _ik()
-    return arrays | {f"train/{name}": values for name, values in _train().items()}
+    return arrays | {f"train/{name}": values for name, values in _train(config).items()}
 
 
 def _images(name: str) -> tuple[np.ndarray, ...]:
@@ -97,18 +98,26 @@ def _camera_positions(scene: Scene, qpos: np.ndarray) -> np.ndarray:
     return np.stack(positions)
 
 
-def _train() -> dict[str, np.ndarray]:
-    """Returns metrics f32[iterations] of a whole run of the preset `smoke` in one chunk."""
-    config = dataclasses.replace(vs.Config.preset("smoke"), num_chunks=1)
-    _, metrics = vs.train(vs.init(jax.random.key(3), config), config)
-    return {name: np.asarray(metrics[name]) for name in ("encoder_loss", "reward", "critic_loss")}
+def _train(config: vs.Config) -> dict[str, np.ndarray]:
+    """Returns metrics f32[iterations] of a whole run."""
+    state, chunks = vs.init(jax.random.key(3), config), []
+    for _ in range(config.num_chunks):
+        state, metrics = vs.train(state, config)
+        chunks.append(metrics)
+    names = ("encoder_loss", "reward", "critic_loss")
+    return {name: np.concatenate([np.asarray(metrics[name]) for metrics in chunks]) for name in names}
 
 
-def start_reference(folder: Path) -> tuple[subprocess.Popen[bytes], Path]:
+def choose_config(is_quick: bool) -> vs.Config:
+    """Returns the config of the small run; in a quick run that of the other sections, which is then compiled once."""
+    return quick_config() if is_quick else dataclasses.replace(vs.Config.preset("smoke"), num_chunks=1)
+
+
+def start_reference(folder: Path, is_quick: bool) -> tuple[subprocess.Popen[bytes], Path]:
     """Starts the process that computes the CPU's arrays; returns it and the file that it writes."""
     path = folder / "reference.npz"
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
-    command = [sys.executable, str(Path(__file__).resolve()), str(path)]
+    command = [sys.executable, str(Path(__file__).resolve()), str(path), *(["--quick"] if is_quick else [])]
     with (folder / "reference.log").open("wb") as log:
         return subprocess.Popen(command, env=environment, stdout=log, stderr=log), path
 
@@ -116,7 +125,7 @@ def start_reference(folder: Path) -> tuple[subprocess.Popen[bytes], Path]:
 def run(settings: Settings, reference: tuple[subprocess.Popen[bytes], Path]) -> Iterator[Row]:
     """Yields a row for each comparison with the CPU: the difference, the largest allowed, and whether it holds."""
     precisions = ("default",) if settings.is_quick else ("default", "highest")
-    ours = compute(precisions)
+    ours = compute(choose_config(settings.is_quick), precisions)
     process, path = reference
     if process.wait(timeout=max(settings.seconds_left, 120.0)) != 0:
         raise RuntimeError("the reference on the CPU failed; see reference.log")
@@ -159,4 +168,5 @@ def _verdict(name: str, value: float, allowed: float) -> Row:
 
 
 if __name__ == "__main__":
-    np.savez(sys.argv[1], **compute())  # pyright: ignore[reportArgumentType] # numpy's stub takes them for a flag
+    arrays = compute(choose_config("--quick" in sys.argv[2:]))
+    np.savez(sys.argv[1], **arrays)  # pyright: ignore[reportArgumentType] # numpy's stub takes them for a flag

@@ -66,9 +66,11 @@ def randomize_lights(key: Array, scene: RenderScene, center: Array) -> RenderSce
 
 
 def jitter_camera(key: Array, camera: Camera) -> Camera:
-    """Returns the camera with a random tilt and zoom: the image shifts by up to 5 % and scales by up to 8 %.
+    """Returns the camera with a random tilt and zoom.
 
-    This costs no time. Resampling the rendered image would take longer than all other image operations together.
+    The image shifts by up to 5 % of its size and scales by up to 8 %. The camera changes before the image is
+    rendered, so this costs no time. Resampling the rendered image would take longer than all other image operations
+    together.
 
     Args:
       key: PRNG key.

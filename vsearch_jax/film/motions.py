@@ -87,7 +87,8 @@ def record_motions(state: TrainState, key: Array | None, config: Config) -> Film
         paths exactly, with "dynamic" as far as the arm's dynamics allow.
 
     Returns:
-      Joint values, durations and similarities of the search.
+      Joint values at each frame; and for each step of the search the duration of its motion and the similarity of its
+      image to the target's.
 
     Raises:
       PlanningError: a joint has no speed limit, so the duration of the motions is not known.

@@ -198,7 +198,7 @@ def evaluate_run(run: Path, state: TrainState, config: Config) -> Evaluated:
     Args:
       run: folder of the run.
       state: the run's last state.
-      config: the run's config. Fields that `evaluate` lets differ may differ.
+      config: the run's config, or a changed one: the fields that `evaluate` names may differ from the stored config.
 
     Returns:
       The measures, the recorded search, and the metrics of the training.
