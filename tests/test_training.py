@@ -33,7 +33,8 @@ def arrays(state):
 
 def run(config, seed=0):
     """Returns state and metrics after all chunks of a run."""
-    state, rows = vs.init(jax.random.key(seed), config), []
+    # The state before training does not depend on the number of chunks, so one compiled `init` serves all.
+    state, rows = vs.init(jax.random.key(seed), dataclasses.replace(config, num_chunks=CONFIG.num_chunks)), []
     for _ in range(config.num_chunks):
         state, metrics = vs.train(state, config)
         rows.append(jax.tree.map(np.asarray, metrics))

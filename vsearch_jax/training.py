@@ -18,7 +18,7 @@ from jax import Array
 
 from vsearch_jax import encoder as encoders
 from vsearch_jax.config import Config
-from vsearch_jax.env import ViewSearchEnv, check_band, encoder_example, obs_of
+from vsearch_jax.env import ViewSearchEnv, check_band, encoder_example, obs_of, zero_observation
 from vsearch_jax.search import sac
 from vsearch_jax.types import EncoderState, Observation, ReplayState, SACState, TrainState, Transition
 from vsearch_jax.xla.tree import tree_where
@@ -63,7 +63,7 @@ def init(key: Array, config: Config) -> TrainState:
       PlanningError: the motion is dynamic and a joint has no speed limit.
     """
     env = ViewSearchEnv(config, encoders.init(jax.random.fold_in(key, _ENCODER_INIT), config))
-    observation = jax.eval_shape(env.random_observation, key)
+    observation = zero_observation(config.encoder.code_size, env.scene.mj_model.nq)
     pool = _zeros(observation, (config.encoder.pool_size,))
     start = jax.eval_shape(env.start, observation, observation)
     num_seeds, num_envs = config.sac.num_seeds, config.sac.num_envs

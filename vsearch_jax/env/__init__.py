@@ -8,6 +8,7 @@ from vsearch_jax.env.episode import (
     obs_of,
     pose_error,
     step_reward,
+    zero_observation,
 )
 from vsearch_jax.env.examples import encoder_example
 from vsearch_jax.env.task import ViewSearchEnv
@@ -22,4 +23,5 @@ __all__ = [
     "obs_of",
     "pose_error",
     "step_reward",
+    "zero_observation",
 ]

@@ -71,6 +71,18 @@ def build_obs(episode: EpisodeState) -> Array:
     return jnp.concatenate([episode.observation.code, episode.target.code, episode.observation.qpos])
 
 
+def zero_observation(code_size: int, num_joint_values: int) -> Observation:
+    """Returns an Observation of zeros, which has the shapes of every other one. To trace a real one takes seconds.
+
+    Args:
+      code_size: Z, number of entries in a code.
+      num_joint_values: nq, number of joint values.
+    """
+    zero = jnp.zeros(())
+    camera = Camera(jnp.zeros(3), jnp.zeros((3, 3)), zero)
+    return Observation(View(zero, zero), jnp.zeros(num_joint_values), camera, jnp.zeros(code_size))
+
+
 def start_state(observation: Observation, target: Observation) -> State:
     """Builds the brax State at the start of an episode.
 

@@ -93,21 +93,25 @@ def distances_from_axes(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
     lowest = center[2] - jnp.abs(half_axis[2]) - radius
     first, second = pairs.first, pairs.second
     axis_distance = primitives.segment_distance(*(_rows(v, i) for i in (first, second) for v in (center, half_axis)))
-    solids = (pairs.boxes, pairs.cylinders, pairs.ellipsoids)
-    sizes = [jax.tree.map(expand, primitives.coordinates(kind.size)) for kind in solids]
-    local_axes = [_axes_in_solid_frames(kind, axes, expand) for kind in solids]
-    solid_distances = (
-        primitives.segment_box_distance(*local_axes[0], sizes[0]),
-        primitives.segment_cylinder_distance(*local_axes[1], *sizes[1][:2]),
-        primitives.min_along_segment(lambda point: primitives.ellipsoid_distance(point, sizes[2]), *local_axes[2]),
+    parts = [lowest[pairs.table] - table_height, axis_distance - radius[first] - radius[second]]
+    solids = (
+        (pairs.boxes, primitives.segment_box_distance),
+        (pairs.cylinders, _segment_cylinder_distance),
+        (pairs.ellipsoids, _segment_ellipsoid_distance),
     )
-    return jnp.concatenate(
-        [
-            lowest[pairs.table] - table_height,
-            axis_distance - radius[first] - radius[second],
-            *(distance - radius[kind.capsule] for distance, kind in zip(solid_distances, solids, strict=True)),
-        ]
-    )
+    for kind, distance in solids:
+        if kind.capsule.size > 0:  # A kind without pairs would take as long to trace as any other.
+            size = jax.tree.map(expand, primitives.coordinates(kind.size))
+            parts.append(distance(*_axes_in_solid_frames(kind, axes, expand), size) - radius[kind.capsule])
+    return jnp.concatenate(parts)
+
+
+def _segment_cylinder_distance(center: Vector, half_axis: Vector, size: Vector) -> Array:
+    return primitives.segment_cylinder_distance(center, half_axis, size[0], size[1])
+
+
+def _segment_ellipsoid_distance(center: Vector, half_axis: Vector, size: Vector) -> Array:
+    return primitives.min_along_segment(lambda point: primitives.ellipsoid_distance(point, size), center, half_axis)
 
 
 def _axes_in_solid_frames(solids: Solids, axes: Axes, expand: Callable[[Array], Array]) -> Axes:
