@@ -1,5 +1,6 @@
 """What every test runs under: the CPU, the compilation cache of the checkout, strict promotion of types and ranks."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -12,6 +13,9 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("MPLBACKEND", "agg")
 # Most of the time goes to compilation. With less of XLA's optimisation it takes half as long, and the tests run alike.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
+
+# Tracing makes millions of objects that live on. To look through them all again and again takes a sixth of its time.
+gc.set_threshold(100_000, 20, 20)
 
 import hypothesis  # noqa: E402 # below the settings above
 import jax  # noqa: E402 # reads the variables above

@@ -144,6 +144,7 @@ def test_last_step_sets_truncated_but_not_done(reset, step):
     assert truncated == [0.0] * (CONFIG.env.episode_length - 1) + [1.0]
 
 
+@pytest.mark.slow
 def test_environment_runs_under_the_wrappers_of_brax(env, with_implicit_promotion):
     # Silhouettes need no light, so there is less to compile.
     config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, input="silhouette"))

@@ -59,6 +59,7 @@ def _errors(env: vs.ViewSearchEnv, views: View, observations) -> tuple[np.ndarra
     return position, np.arccos(np.clip((cosine - 1) / 2, -1, 1))
 
 
+@pytest.mark.slow
 def test_path_ends_at_the_solution_of_inverse_kinematics(path_results, ik_results):
     (qpos, is_solved), has_path = ik_results, np.asarray(path_results[1].is_found)
     assert not np.any(has_path & ~np.asarray(is_solved))
@@ -77,6 +78,7 @@ def test_dynamic_motion_ends_near_the_view(env):
     assert np.all(position[is_reachable] < 2e-3) and np.all(rotation[is_reachable] < np.deg2rad(0.3))
 
 
+@pytest.mark.slow
 def test_planned_motion_costs_at_least_the_straight_motion(env, path_results, ik_results):
     (_, motions), (qpos, _) = path_results, ik_results
     _, start = _views(env, 8)

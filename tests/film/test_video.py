@@ -103,6 +103,7 @@ def film(config: vs.Config, state: TrainState, tmp_path_factory: pytest.TempPath
     return out, message
 
 
+@pytest.mark.slow
 def test_a_film_shows_the_search_in_real_time(config: vs.Config, state: TrainState, film: tuple[Path, str]) -> None:
     out, message = film
     search = record(state, None, with_motion(config, "kinematic"))

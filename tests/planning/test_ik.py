@@ -97,6 +97,7 @@ def test_ik_solves_poses_that_are_reachable_by_construction(scene, arm):
     np.testing.assert_array_equal(result.qpos[:, 7:], present[:, 7:])  # the fingers do not move
 
 
+@pytest.mark.slow
 def test_ik_solves_another_arm(tmp_path):
     path = tmp_path / "second.xml"
     path.write_text(MJCF)
@@ -134,6 +135,7 @@ def test_nullspace_steps_bring_the_arm_near_and_off_its_limits(arm):
     assert less_at_limits < at_limits
 
 
+@pytest.mark.slow
 def test_a_free_roll_aligns_only_the_optical_axis(scene):
     config = dataclasses.replace(CONFIG, is_roll_free=True)
     poses, present, result = _solve_all_lwr(config)
