@@ -1,3 +1,4 @@
+import importlib.metadata
 import re
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import pytest
 from command_line import user_error
 
 from vsearch_jax.cli.commands import COMMANDS, Export, Train, Video
+from vsearch_jax.cli.main import main
 from vsearch_jax.cli.parse import parse
 from vsearch_jax.config import Config
 
@@ -73,6 +75,24 @@ def test_the_last_preset_counts(capsys: pytest.CaptureFixture[str], tmp_path: Pa
     assert "--preset is 'big'" in user_error(capsys, "train", "--preset", "smoke", "--preset", "big", "--out", out)
 
 
+def test_an_empty_value_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = str(tmp_path / "run")
+    assert "the value of --object is empty" in user_error(capsys, "train", "--object", "", "--out", out)
+
+
+def test_a_folder_below_a_file_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    error = user_error(capsys, "reach", "--out", str(tmp_path / "file" / "run"))
+    assert re.search(r"--out is .*, but the folder .* cannot be made \(Not a directory\); name another folder", error)
+
+
+def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["--version"])
+    assert not exit_.value.code
+    assert capsys.readouterr().out.strip() == f"vsearch_jax {importlib.metadata.version('vsearch_jax')}"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -92,6 +112,8 @@ def test_the_last_preset_counts(capsys: pytest.CaptureFixture[str], tmp_path: Pa
         ("reach --out {out} --radius -1", "--radius is -1"),
         ("reach --out {out} --mesh-scale 0", "--mesh-scale is 0"),
         ("info --bogus", "--bogus"),
+        ("train --out {out} --preset=", "the value of --preset is empty"),
+        ("train --out= --preset smoke", "the value of --out is empty"),
     ],
 )
 def test_an_error_of_the_user_is_one_line_and_makes_no_file(

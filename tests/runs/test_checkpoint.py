@@ -149,6 +149,22 @@ def test_every_file_cut_in_half_is_an_error_of_one_line(tmp_path: Path, template
     assert_same(checkpoint.restore(tmp_path, template, CONFIG), state)
 
 
+def test_a_changed_byte_is_an_error_or_changes_nothing(tmp_path: Path, template: Any) -> None:
+    """Orbax notices damage to its index only. The values have checksums of ours."""
+    state = make_run(jax.random.key(0), 3)
+    checkpoint.save(tmp_path, state, CONFIG)
+    path = largest_file(tmp_path / "checkpoints" / "3" / "state")
+    whole, num_damaging = path.read_bytes(), 0
+    for place in range(0, len(whole), max(1, len(whole) // 60)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        try:
+            assert_same(checkpoint.restore(tmp_path, template, CONFIG), state)
+        except CheckpointError as error:
+            num_damaging += 1
+            assert "damaged" in str(error)
+    assert num_damaging > 0
+
+
 def test_a_damaged_checkpoint_is_moved_aside_and_the_earlier_one_is_read(tmp_path: Path, template: Any) -> None:
     states = [make_run(jax.random.key(step), step) for step in (2, 4)]
     for state in states:

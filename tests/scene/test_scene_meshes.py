@@ -42,9 +42,9 @@ def test_a_mesh_is_centred_on_the_table(tmp_path):
     np.testing.assert_allclose(vertices.max(axis=0), [0.05, 0.025, 0.07], atol=1e-6)
 
 
-@pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "glb", "off"])
+@pytest.mark.parametrize("suffix", ["obj", "stl", "stl_ascii", "ply", "glb", "off"])
 def test_meshes_of_all_formats_have_the_same_vertices_in_world(tmp_path, suffix, caplog):
-    path = tmp_path / f"part.{suffix}"
+    path = tmp_path / f"part.{suffix.removesuffix('_ascii')}"
     shape = trimesh.creation.box((0.1, 0.06, 0.04), transform=trimesh.transformations.translation_matrix((3, 4, 5)))
     path.write_bytes(_as_bytes(shape.export(file_type=suffix)))
     scene = build_scene(SceneConfig(object=str(path)))

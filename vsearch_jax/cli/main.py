@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from vsearch_jax.cli.commands import COMMANDS, Command, Info, Train
 from vsearch_jax.cli.option_names import use_option_names
 from vsearch_jax.cli.parse import parse
-from vsearch_jax.runs.folder import ConfigFileError
+from vsearch_jax.runs.folder import ConfigFileError, resume_command
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 + SIGINT, as in shells."""
@@ -93,7 +93,7 @@ def _describe_interrupt(command: Command | None) -> str:
     step = latest_step(command.out)
     if step is None:
         return "interrupted before anything was saved; give the same command again to start again"
-    return f"interrupted; {step} iterations are saved. Resume with: vsearch train --out {command.out} --resume"
+    return f"interrupted; {step} iterations are saved. Resume with: {resume_command(command.out)}"
 
 
 if __name__ == "__main__":

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib.metadata
 import io
 import itertools
 import os
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar, cast
@@ -40,6 +42,13 @@ def parse(arguments: Sequence[str]) -> Command:
       RunError: --resume is given, and --out holds no run.
     """
     name, *rest = arguments or [""]
+    if name == "--version":
+        print(f"vsearch_jax {importlib.metadata.version('vsearch_jax')}")
+        sys.exit()
+    for before, argument in itertools.pairwise([name, *rest]):
+        if argument == "" or re.fullmatch(r"--[\w.-]+=", argument):
+            option = argument.rstrip("=") or before
+            raise UsageError(f"the value of {option} is empty; give a value, or leave the option out")
     if name == "train":
         default = Train(out=tyro.MISSING, config=_starting_config(rest))
         return _apply_shortcuts(_parse_as(Train, rest, f"vsearch {name}", default))

@@ -12,6 +12,7 @@ import importlib.metadata
 import json
 import logging
 import sys
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NotRequired, Protocol, TypeAlias, TypedDict, TypeVar, cast
@@ -23,7 +24,7 @@ import orbax.checkpoint as ocp
 import tensorstore
 
 from vsearch_jax.config import Config
-from vsearch_jax.runs.folder import CHECKPOINTS
+from vsearch_jax.runs.folder import CHECKPOINTS, resume_command
 from vsearch_jax.runs.old_versions import UNVERSIONED, current_names
 
 NUM_KEPT = 2
@@ -54,12 +55,14 @@ class _About(TypedDict):
       config: `Config.to_dict` of the run.
       keys: for each typed PRNG key the name of its implementation.
       arrays: for each array its shape and dtype.
+      checksums: for each array the CRC-32 of its bytes; missing in checkpoints of versions before 0.3.0.
     """
 
     version: NotRequired[str]
     config: dict[str, object]
     keys: dict[str, str]
     arrays: dict[str, Described]
+    checksums: NotRequired[dict[str, int]]
 
 
 class CheckpointError(ValueError):
@@ -85,6 +88,7 @@ def save(run: Path, state: _HasStep, config: Config) -> None:
         "config": config.to_dict(),
         "keys": {name: str(jax.random.key_impl(leaf)) for name, leaf in leaves.items() if _is_key(leaf)},
         "arrays": {name: _shape_and_dtype(array) for name, array in stored.items()},
+        "checksums": {name: _checksum(array) for name, array in stored.items()},
     }
     arguments = ocp.args.Composite(state=ocp.args.StandardSave(_nonempty(stored)), about=ocp.args.JsonSave(about))
     with _quiet_errors(), _manager(run) as manager:
@@ -133,6 +137,10 @@ def restore(run: Path, template: State, config: Config) -> State:
     expected = {name: _shape_and_dtype(leaf) for name, leaf in leaves.items()}
     _check_arrays(folder, {names[stored]: described[stored] for stored in names}, expected, version)
     arrays = _read_arrays(run, step, described)
+    # Orbax notices damage to its index, not to the values.
+    changed = [name for name, sum_ in about.get("checksums", {}).items() if _checksum(arrays[name]) != sum_]
+    if changed:
+        raise _damaged(run, step, f"the values of {changed[0]} differ from those that were saved")
     current = {names[stored]: array for stored, array in arrays.items() if stored in names}
     keys = {names[stored]: implementation for stored, implementation in about["keys"].items()}
     restored = [_to_leaf(current[name], keys.get(name)) for name in expected]
@@ -185,13 +193,7 @@ def _manager(run: Path) -> ocp.CheckpointManager:
 
 
 def _read_arrays(run: Path, step: int, described: Mapping[str, Described]) -> dict[str, np.ndarray]:
-    """Reads all arrays of a checkpoint.
-
-    Args:
-      run: folder of the run.
-      step: step of the checkpoint.
-      described: shape and dtype of each stored array.
-    """
+    """Reads all arrays of the checkpoint of `step`; `described` holds shape and dtype of each stored array."""
     # Orbax needs templates. They are numpy arrays, because it would place JAX arrays on the devices that saved them.
     empty = {name: np.empty(shape, jnp.dtype(dtype)) for name, (shape, dtype) in described.items()}
     read = _read(run, step, "state", ocp.args.StandardRestore(_nonempty(empty)))
@@ -208,13 +210,20 @@ def _read(run: Path, step: int, item: str, arguments: ocp.args.CheckpointArgs) -
     except (PermissionError, MemoryError):
         raise
     except Exception as error:  # A damaged file raises one of a dozen types, from JSON's to tensorstore's.
-        earlier = [other for other in _steps(run) if other < step]
-        resume = (
-            f"move that folder out of {run / CHECKPOINTS} and resume from iteration {max(earlier, default=0)}: "
-            f"vsearch train --out {run} --resume"
-        )
-        remedy = resume if earlier else "there is no other checkpoint; start a new run in another folder"
-        raise CheckpointError(f"checkpoint {folder} is damaged ({_first_line(error)}); {remedy}") from error
+        raise _damaged(run, step, _first_line(error)) from error
+
+
+def _damaged(run: Path, step: int, reason: str) -> CheckpointError:
+    earlier = [other for other in _steps(run) if other < step]
+    remedy = "there is no other checkpoint; start a new run in another folder"
+    if earlier:
+        aside = f"move that folder out of {run / CHECKPOINTS} and resume from iteration {max(earlier)}"
+        remedy = f"{aside}: {resume_command(run)}"
+    return CheckpointError(f"checkpoint {run / CHECKPOINTS / str(step)} is damaged ({reason}); {remedy}")
+
+
+def _checksum(array: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data) if array.size else 0
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -41,17 +42,22 @@ class ConfigFileError(ConfigError):
     """The file `config.json` of a run is damaged, or a value in it is out of range. The message names the remedy."""
 
 
+def resume_command(run: Path) -> str:
+    """Returns the command line that continues a run, for error messages: it can be pasted into a shell."""
+    return f"vsearch train --out {shlex.quote(str(run))} --resume"
+
+
 def make_new_folder(folder: Path) -> None:
     """Makes the folder for new files, such as a run or an export. An existing empty folder is accepted.
 
     Raises:
-      RunError: the folder is not empty, or `folder` is a file.
+      RunError: the folder is not empty or cannot be made, or `folder` is a file.
     """
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         is_run = (folder / CONFIG).is_file()
-        hint = f", or continue the run in it: vsearch train --out {folder} --resume" if is_run else ""
+        hint = f", or continue the run in it: {resume_command(folder)}" if is_run else ""
         raise RunError(f"`folder` is {folder}, which exists; name another folder{hint}")
-    folder.mkdir(parents=True, exist_ok=True)
+    _make_folder("folder", folder, folder)
 
 
 def check_new_file(path: Path, suffix: str) -> None:
@@ -62,13 +68,22 @@ def check_new_file(path: Path, suffix: str) -> None:
       suffix: how the name of the file must end, for example ".mp4".
 
     Raises:
-      RunError: something exists at `path`, or the name does not end in `suffix`.
+      RunError: something exists at `path`, the name does not end in `suffix`, or the folder cannot be made.
     """
     if path.suffix.lower() != suffix:
         raise RunError(f"`path` is {path}; name a file that ends in {suffix}")
     if path.exists():
         raise RunError(f"`path` is {path}, which exists; name another file")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder("path", path, path.parent)
+
+
+def _make_folder(option: str, value: Path, folder: Path) -> None:
+    """Makes `folder`, where a file or folder `value` is to be; an error names the option that gave `value`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = f"the folder {folder} cannot be made ({error.strerror})"
+        raise RunError(f"`{option}` is {value}, but {reason}; name another folder") from error
 
 
 @contextlib.contextmanager

@@ -21,7 +21,15 @@ import numpy as np
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.evaluation import Outcome, check_target, evaluate, record_search
 from vsearch_jax.runs import checkpoint
-from vsearch_jax.runs.folder import MAX_SEED, RunError, new_run_folder, read_config, read_seed, write_config
+from vsearch_jax.runs.folder import (
+    MAX_SEED,
+    RunError,
+    new_run_folder,
+    read_config,
+    read_seed,
+    resume_command,
+    write_config,
+)
 from vsearch_jax.runs.interrupts import OnInterrupt, call_interruptibly, stop_on_signal
 from vsearch_jax.runs.metrics_log import STAGES, MetricsLine, MetricsLog, read_metrics
 from vsearch_jax.training import init, train
@@ -233,9 +241,7 @@ def check_finished(run: Path, state: TrainState, config: Config) -> None:
     """
     step, num_iterations = int(state.step), config.num_iterations
     if step < num_iterations:
-        raise RunError(
-            f"{run} has done {step} of {num_iterations} iterations; finish the run: vsearch train --out {run} --resume"
-        )
+        raise RunError(f"{run} has done {step} of {num_iterations} iterations; finish the run: {resume_command(run)}")
 
 
 def release_memory() -> None:

@@ -11,6 +11,7 @@ import trimesh
 MESH_SUFFIXES = (".obj", ".stl", ".msh", ".ply", ".glb", ".gltf", ".off")
 # MuJoCo reads these files itself, which keeps normals and texture coordinates.
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
+_MAX_STL_FACES = 200_000
 
 # m. A smaller object covers only a few pixels of the wrist camera's image.
 _MIN_SIZE = 0.005
@@ -120,5 +121,14 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, max_size: float) -> Mesh
 
 
 def is_read_by_mujoco(path: Path) -> bool:
-    """Returns whether MuJoCo can read a mesh file itself, judged by the suffix of `path`."""
+    """Returns whether MuJoCo can read a mesh file itself. It reads binary STL files of up to 200,000 faces only.
+
+    Args:
+      path: an existing file with a suffix of `MESH_SUFFIXES`.
+    """
+    if path.suffix.lower() == ".stl":
+        with path.open("rb") as file:
+            header = file.read(84)
+        num_faces = int.from_bytes(header[80:], "little")
+        return path.stat().st_size == 84 + 50 * num_faces and num_faces <= _MAX_STL_FACES
     return path.suffix.lower() in _READ_BY_MUJOCO
