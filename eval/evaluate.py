@@ -21,6 +21,7 @@ import numpy as np
 import vsearch_jax as vs
 from vsearch_jax import report, runs
 from vsearch_jax.evaluation import record_search
+from vsearch_jax.search import LABELS
 
 
 def evaluate(run: Path, out: Path, episodes: int, target_deg: tuple[float, float], batch_size: int) -> None:
@@ -53,8 +54,9 @@ def evaluate(run: Path, out: Path, episodes: int, target_deg: tuple[float, float
     lines = runs.read_metrics(run)
     evaluated = runs.Evaluated(arrays, search, state.reach, lines, {"evaluation": seconds}, runs.read_seed(run))
     results = report.write_report(out, evaluated, config)
-    for name in report.SEARCHERS:
-        print(f"{name}: success {results[name]['success_rate']:.3f}, {results[name]['evaluations_mean']:.1f} images")
+    for name in LABELS:
+        ours = results[name]
+        print(f"{name}: pose success {ours['pose_success_rate']:.3f}, {ours['evaluations_mean']:.1f} images")
     print(f"{seconds:.1f} s, compilation included; wrote {out / 'report.html'}")
 
 

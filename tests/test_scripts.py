@@ -15,8 +15,9 @@ import pytest
 
 import vsearch_jax as vs
 from samples import fast_run
-from vsearch_jax import render, report, runs
+from vsearch_jax import render, runs
 from vsearch_jax.runs import loop
+from vsearch_jax.search import LABELS
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = vs.Config.preset("smoke")
@@ -77,9 +78,9 @@ def test_train_writes_every_file_of_a_run(
     assert [line["iteration"] for line in runs.read_metrics(folder)] == list(range(CONFIG.num_iterations))
     results = json.loads((folder / "results.json").read_text())
     assert results["seed"] == SEED and results["wall_seconds"]["evaluation"] >= 0.0
-    assert set(report.SEARCHERS) <= set(results)
+    assert set(LABELS) <= set(results)
     printed = capsys.readouterr().out
-    assert f"{CONFIG.num_iterations}/{CONFIG.num_iterations}" in printed and "sac: success" in printed
+    assert f"{CONFIG.num_iterations}/{CONFIG.num_iterations}" in printed and "sac: pose success" in printed
     with pytest.raises(runs.RunError, match="exists; name another folder"):
         script.train(folder, CONFIG, SEED)
 

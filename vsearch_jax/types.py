@@ -268,13 +268,11 @@ class PolicyEnd(NamedTuple):
 
     Attributes:
       state: brax State at the end of the episode.
-      num_helped: i32[], number of steps that the local search chose, not the policy.
       travel: f32[] rad, length of the arm's path in joint space, summed over the steps.
       duration: f32[] s, time of the arm's motions, summed over the steps.
     """
 
     state: State
-    num_helped: Array
     travel: Array
     duration: Array
 

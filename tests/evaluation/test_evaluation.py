@@ -11,6 +11,7 @@ import pytest
 import vsearch_jax as vs
 from vsearch_jax import evaluation
 from vsearch_jax.config import ConfigError, EvaluationConfig
+from vsearch_jax.search import BLACK_BOX, LABELS, POLICIES
 
 CONFIG = vs.Config.preset("smoke")
 
@@ -37,12 +38,13 @@ def results(state, request):
 
 def test_results_have_one_entry_for_each_trial(results):
     trials = CONFIG.evaluation.num_initial_views * CONFIG.evaluation.num_runs
-    for name in ("random_search", "cma_es"):
+    for name in BLACK_BOX:
         assert results[name]["is_success"].shape == (trials,)
-    assert results["sac"]["is_success"].shape == (CONFIG.sac.num_seeds, CONFIG.evaluation.num_episodes)
+    for name in POLICIES:
+        assert results[name]["is_success"].shape == (CONFIG.sac.num_seeds, CONFIG.evaluation.num_episodes)
 
 
-@pytest.mark.parametrize("name", ["random_search", "cma_es", "sac"])
+@pytest.mark.parametrize("name", LABELS)
 def test_success_meets_the_threshold_and_false_positives_are_distant_successes(results, name):
     outcome = results[name]
     np.testing.assert_array_equal(outcome["is_success"], outcome["final_cosine"] >= np.float32(CONFIG.env.threshold))
@@ -52,10 +54,10 @@ def test_success_meets_the_threshold_and_false_positives_are_distant_successes(r
     assert (np.diff(outcome["best_scores"], axis=-1) >= 0.0).all()
 
 
-@pytest.mark.parametrize("name", ["random_search", "cma_es", "sac"])
+@pytest.mark.parametrize("name", LABELS)
 def test_motions_are_counted_and_respect_the_speed_limits(results, name):
     outcome = results[name]
-    np.testing.assert_array_equal(outcome["num_plans"], outcome["evaluations"] - (name != "sac"))
+    np.testing.assert_array_equal(outcome["num_plans"], outcome["evaluations"] - (name in BLACK_BOX))
     has_moved = outcome["num_plans"] > outcome["unreachable"]
     assert ((outcome["joint_travel"] > 0.0) == has_moved).all()
     assert ((outcome["motion_time"] > 0.0) == has_moved).all()

@@ -19,11 +19,14 @@ from vsearch_jax.config import Config
 from vsearch_jax.report.page import CAPTIONS
 from vsearch_jax.report.table import table_rows
 from vsearch_jax.runs.loop import Evaluated
+from vsearch_jax.search import BLACK_BOX, LABELS, POLICIES
 
 CONFIG = Config.preset("smoke")
 CONTRACT = {
     "success_rate",
     "success_rate_ci95",
+    "pose_success_rate",
+    "pose_success_5deg_rate",
     "episodes",
     "evaluations_mean",
     "evaluations_p99",
@@ -72,9 +75,11 @@ def metrics_lines() -> list[dict[str, Any]]:
 
 
 def test_results_have_the_keys_of_the_contract(results: dict[str, Any]) -> None:
-    for name in report.SEARCHERS:
+    for name in LABELS:
         assert results[name].keys() >= CONTRACT
-    assert results["sac"].keys() >= {"steps_lower_bound_mean", "environment_steps", "seeds"}
+    for name in POLICIES:
+        wanted = {"steps_lower_bound_mean", "below_bound_rate", "environment_steps", "images_rendered", "seeds"}
+        assert results[name].keys() >= wanted
     assert results.keys() >= {"thesis", "versions", "wall_seconds"}
     assert [seed["seed"] for seed in results["sac"]["seeds"]] == [0, 1, 2]
     assert all(seed.keys() >= CONTRACT for seed in results["sac"]["seeds"])
@@ -86,7 +91,7 @@ def test_results_agree_with_the_arrays(arrays: dict[str, Any], results: dict[str
     assert ours["success_rate"] == pytest.approx(raw["is_success"].mean())
     assert ours["evaluations_p99"] == pytest.approx(np.percentile(raw["evaluations"], 99))
     degrees = [math.degrees(error) for error in raw["rotation_error"]]
-    assert ours["rotation_error_deg_mean"] == pytest.approx(sum(degrees) / 12, rel=1e-5)
+    assert ours["rotation_error_deg_mean"] == pytest.approx(sum(degrees) / 24, rel=1e-5)
     assert ours["translation_error_cm_mean"] == pytest.approx(100 * raw["translation_error"].mean(), rel=1e-5)
     assert ours["unreachable_rate"] == pytest.approx(raw["unreachable"].sum() / raw["evaluations"].sum())
     for key in ("evaluations_mean", "rotation_error_deg_mean"):
@@ -97,24 +102,12 @@ def test_results_agree_with_the_arrays(arrays: dict[str, Any], results: dict[str
     assert results["sac"]["evaluations_over_lower_bound"] == pytest.approx(4 / 3)
 
 
-@pytest.mark.parametrize(
-    ("successes", "total", "low", "high"),
-    # Newcombe 1998, Statistics in Medicine 17, table I, method 3 (Wilson's score interval).
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
-)
-def test_rates_have_wilsons_interval(successes: int, total: int, low: float, high: float) -> None:
-    trials = made_up.trials((total,), 5) | {"is_success": np.arange(total) < successes}
-    raw = {"random_search": trials, "cma_es": trials, "sac": made_up.trials((1, 4), 5)}
-    interval = report.summarize_results(raw, CONFIG, {})["random_search"]["success_rate_ci95"]
-    assert interval == pytest.approx([low, high], abs=5e-5)
-
-
 def test_means_of_one_trial_have_no_interval() -> None:
-    one = made_up.trials((1,), 5)
-    raw = {"random_search": one, "cma_es": one, "sac": made_up.trials((1, 1), 5)}
-    results = report.summarize_results(raw, CONFIG, {})
+    one = {name: made_up.trials((1,), 5) for name in BLACK_BOX}
+    policy = made_up.trials((1, 1), 5)
+    results = report.summarize_results(one | {"sac": policy, "sac_assisted": policy}, CONFIG, {})
     assert results["cma_es"]["evaluations_mean_ci95"] is None
-    assert all(len(cells) == 3 for _, cells in table_rows(results))
+    assert all(len(cells) == len(LABELS) for _, cells in table_rows(results))
 
 
 def test_an_arm_without_speed_limits_has_no_motion_time(arrays: dict[str, Any]) -> None:
@@ -126,17 +119,41 @@ def test_an_arm_without_speed_limits_has_no_motion_time(arrays: dict[str, Any]) 
 
 
 def test_a_search_that_reached_no_view_has_no_mean_cosine(arrays: dict[str, Any]) -> None:
-    blank = arrays | {"cma_es": arrays["cma_es"] | {"final_cosine": np.full(12, -np.inf)}}
+    blank = arrays | {"cma_es": arrays["cma_es"] | {"final_cosine": np.full(24, -np.inf)}}
     results = report.summarize_results(blank, CONFIG, {})
     assert results["cma_es"]["final_cosine_mean"] is None
     json.dumps(results, allow_nan=False)
 
 
-def test_helped_episodes_are_counted_separately(arrays: dict[str, Any]) -> None:
-    num_helped = (np.arange(120).reshape(3, 40) % 4 == 0).astype(np.int32)
-    policies = arrays["sac"] | {"num_helped": num_helped, "is_success": np.ones((3, 40), bool)}
-    results = report.summarize_results(arrays | {"sac": policies}, CONFIG, {})["sac"]
-    assert (results["success_rate"], results["helped_rate"], results["unaided_success_rate"]) == (1.0, 0.25, 0.75)
+def test_the_policy_alone_and_with_help_have_rows_of_their_own(results: dict[str, Any]) -> None:
+    assert results["sac_assisted"]["helped_rate"] == 0.25
+    assert "helped_rate" not in results["sac"]
+
+
+def test_what_helps_a_searcher_is_counted(results: dict[str, Any]) -> None:
+    assert results["random_search"]["wide_rate"] == pytest.approx(2 / 3)
+    assert results["cma_es_restarts"]["restarts_mean"] == pytest.approx(1.0)
+    assert results["cma_es"].keys() & {"wide_rate", "restarts_mean"} == set()
+
+
+def test_pose_success_needs_the_threshold_and_the_pose(arrays: dict[str, Any]) -> None:
+    degrees = np.tile(np.float32([3.0, 7.0, 20.0, 3.0]), 6)
+    is_success = np.tile([True, True, True, False], 6)
+    trials = arrays["cma_es"] | {
+        "is_success": is_success,
+        "rotation_error": np.deg2rad(degrees),
+        "is_false_positive": is_success & (degrees > 10.0),
+    }
+    results = report.summarize_results(arrays | {"cma_es": trials}, CONFIG, {})
+    ours = results["cma_es"]
+    assert (ours["success_rate"], ours["pose_success_rate"], ours["pose_success_5deg_rate"]) == (0.75, 0.5, 0.25)
+    warning = report.false_positive_warning(results)
+    assert warning is not None and "CMA-ES 25.0 %" in warning and "Random search" not in warning
+
+
+def test_no_warning_without_false_positives(arrays: dict[str, Any]) -> None:
+    right = {name: raw | {"is_false_positive": np.zeros_like(raw["is_success"])} for name, raw in arrays.items()}
+    assert report.false_positive_warning(report.summarize_results(right, CONFIG, {})) is None
 
 
 def test_table_shows_ours_beside_the_thesis(results: dict[str, Any]) -> None:
@@ -144,10 +161,10 @@ def test_table_shows_ours_beside_the_thesis(results: dict[str, Any]) -> None:
     report.print_table(results, console)
     text = console.export_text()
     rate = results["random_search"]["success_rate"]
-    assert re.search(rf"success \(%\).* {100 * rate:.2f} .*–.* 95\.00 ", text)
+    assert re.search(rf"success by cosine \(%\).* {100 * rate:.2f} .*–.* 95\.00 ", text)
     assert "40.00–60.00" in text
     assert "…" not in text  # rich cuts a cell that is too wide with "…"
-    assert "SAC seed 2" in text
+    assert "SAC alone, seed 2" in text
 
 
 def test_report_writes_results_figures_and_one_page(tmp_path: Path, evaluated: Evaluated) -> None:
@@ -155,7 +172,7 @@ def test_report_writes_results_figures_and_one_page(tmp_path: Path, evaluated: E
     assert results["seed"] == 7
     assert json.loads((tmp_path / "results.json").read_text()) == json.loads(json.dumps(results))
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == len(CAPTIONS) == 7
+    assert page.count("data:image/png;base64,") == len(CAPTIONS) == 8
     assert "http" not in page
     assert {path.stem for path in (tmp_path / "figures").iterdir()} == set(CAPTIONS)
     for name in CAPTIONS:

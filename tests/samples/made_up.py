@@ -40,14 +40,18 @@ def trials(shape: tuple[int, ...], generations: int, seed: int = 0) -> dict[str,
 
 
 def evaluation(num_seeds: int = 1) -> dict[str, Any]:
-    """Returns a made-up result of `evaluate`: 12 trials of each black-box searcher, 40 episodes of each policy."""
+    """Returns a made-up result of `evaluate`: 24 trials of each black-box searcher, 40 episodes of each policy."""
     shape = (num_seeds, 40)
-    steps = {
-        "evaluations": np.full(shape, 4),
-        "steps_lower_bound": np.full(shape, 3),
-        "num_helped": np.zeros(shape, np.int32),
+    steps = {"evaluations": np.full(shape, 4), "steps_lower_bound": np.full(shape, 3)}
+    policies = trials(shape, 20) | steps
+    count = np.arange(24, dtype=np.int32) % 3
+    return {
+        "random_search": trials((24,), 30) | {"num_wide": count},
+        "cma_es": trials((24,), 30, 1),
+        "cma_es_restarts": trials((24,), 30, 2) | {"num_restarts": count},
+        "sac": policies | {"num_helped": np.zeros(shape, np.int32)},
+        "sac_assisted": policies | {"num_helped": (np.arange(np.prod(shape)).reshape(shape) % 4 == 0).astype(np.int32)},
     }
-    return {"random_search": trials((12,), 30), "cma_es": trials((12,), 30, 1), "sac": trials(shape, 20) | steps}
 
 
 def search() -> dict[str, Any]:

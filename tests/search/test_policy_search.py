@@ -1,9 +1,10 @@
-"""The local search that helps a policy.
+"""Searches by a policy, alone and with a local search.
 
 The policies are not trained. Each one moves straight to a fixed view, its aim.
 """
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -69,17 +70,26 @@ def step(state: State, action: jax.Array) -> State:
 
 @pytest.fixture
 def run_episodes(monkeypatch):
-    """Returns a function: (initial views, aims), each View of f32[N] rad -> SearchResult of one episode for each."""
+    """Returns a function that runs one episode for each of N initial views and aims, View of f32[N] rad each.
+
+    It returns their SearchResult and the number of steps that the local search chose.
+    """
     monkeypatch.setattr(policy, "act", lambda key, actor, obs, config: obs)
 
-    def episode(key, view, aim):
+    def episode(key, view, aim, is_assisted):
         start = initial_state(view, aim)
         task = sac.PolicyTask(nnx.State({}), start)
         args = SearchArgs(view, jnp.array(probes.BAND), jnp.float32(CONFIG.env.threshold), task)
-        return sac.search(key, step, args, CONFIG)
+        if is_assisted is None:
+            return sac.search(key, step, args, CONFIG), jnp.int32(0)
+        return sac.assisted.search(key, step, args, CONFIG, is_assisted)
 
-    keys = jax.random.split(jax.random.key(0), NUM_EPISODES)
-    return lambda initial, aims: jax.jit(jax.vmap(episode))(keys, initial, aims)
+    def run(initial, aims, is_assisted=True):
+        keys = jax.random.split(jax.random.key(0), NUM_EPISODES)
+        episodes = jax.vmap(functools.partial(episode, is_assisted=is_assisted))
+        return jax.jit(episodes)(keys, initial, aims)
+
+    return run
 
 
 def random_initial_views() -> View:
@@ -99,9 +109,9 @@ def repeated(view: View) -> View:
 
 
 def test_a_policy_that_finds_the_target_is_not_helped(run_episodes):
-    result = run_episodes(random_initial_views(), repeated(TARGET))
+    result, num_helped = run_episodes(random_initial_views(), repeated(TARGET))
     assert (np.asarray(result.score) >= CONFIG.env.threshold).all()
-    assert (np.asarray(result.end.num_helped) == 0).all()
+    assert (np.asarray(num_helped) == 0).all()
     np.testing.assert_allclose(result.end.travel, 0.5 * np.asarray(result.evaluations))
     np.testing.assert_allclose(result.end.duration, 2.0 * np.asarray(result.evaluations))
     assert np.asarray(result.evaluations).max() <= 6
@@ -109,17 +119,17 @@ def test_a_policy_that_finds_the_target_is_not_helped(run_episodes):
 
 @pytest.mark.parametrize("degrees", [3.3, 4.5, 6.0])
 def test_a_policy_that_stops_near_the_target_is_helped_to_it(run_episodes, degrees):
-    result = run_episodes(random_initial_views(), circle_around_target(degrees))
+    result, num_helped = run_episodes(random_initial_views(), circle_around_target(degrees))
     assert (np.asarray(result.score) >= CONFIG.env.threshold).all()
-    num_helped = np.asarray(result.end.num_helped)
+    num_helped = np.asarray(num_helped)
     assert (num_helped > 0).mean() > 0.8  # the other policies pass the target on their way
     assert num_helped.mean() <= 5.0
 
 
 def test_a_policy_that_stays_far_from_the_target_is_moved_around_the_object(run_episodes):
     far = View(TARGET.azimuth + jnp.linspace(1.5, 4.5, NUM_EPISODES), jnp.full(NUM_EPISODES, TARGET.elevation))
-    result = run_episodes(far, far)
-    assert (np.asarray(result.end.num_helped) > 0).all()
+    result, num_helped = run_episodes(far, far)
+    assert (np.asarray(num_helped) > 0).all()
     assert (np.asarray(result.best_scores[:, CONFIG.evaluation.patience - 1]) < 0.5).all()
     assert (np.asarray(result.best_scores[:, -1]) > 0.5).mean() > 0.9  # the arm came to the side of the target
 
@@ -127,6 +137,19 @@ def test_a_policy_that_stays_far_from_the_target_is_moved_around_the_object(run_
 def test_an_unreachable_step_is_not_repeated_forever(run_episodes):
     above = View(jnp.full(NUM_EPISODES, TARGET.azimuth), jnp.full(NUM_EPISODES, probes.BAND[1] + 1.0))
     top = View(random_initial_views().azimuth, jnp.full(NUM_EPISODES, probes.BAND[1]))
-    result = run_episodes(top, above)
+    result, _ = run_episodes(top, above)
     # Without help all 20 steps would be unreachable. With help at most every second step is.
     assert (2 * np.asarray(result.unreachable) <= np.asarray(result.evaluations) + 1).all()
+
+
+def test_without_help_the_assisted_search_is_that_of_the_policy_alone(run_episodes):
+    """Half of the policies find their target. The others stop 4.5 degrees away from it, and no help comes."""
+    is_found = np.arange(NUM_EPISODES) % 2 == 0
+    aims = jax.tree.map(lambda a, b: jnp.where(is_found, a, b), repeated(TARGET), circle_around_target(4.5))
+    alone, _ = run_episodes(random_initial_views(), aims, is_assisted=None)
+    unhelped, num_helped = run_episodes(random_initial_views(), aims, is_assisted=False)
+    for ours, expected in zip(jax.tree.leaves(unhelped), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(ours, expected)
+    assert (np.asarray(num_helped) == 0).all()
+    success = (np.asarray(alone.score) >= CONFIG.env.threshold)[~is_found].mean()
+    assert success < 0.5, "the aims must be views that do not meet the threshold"

@@ -31,7 +31,8 @@ def random_problems(num: int):
 def results() -> dict[float, SearchResult]:
     keys = jax.random.split(jax.random.key(0), 500)
     args = random_problems(500)
-    return {k: run_searches(keys, args, probes.unreachable_outside_band, RandomSearchConfig(k=k)) for k in (0.5, 1.5)}
+    configs = {k: RandomSearchConfig(k=k, num_wide=0) for k in (0.5, 1.5)}  # the thesis's rule
+    return {k: run_searches(keys, args, probes.unreachable_outside_band, config) for k, config in configs.items()}
 
 
 def test_finds_the_target_past_a_false_optimum_within_60_images(results):
@@ -45,6 +46,24 @@ def test_finds_the_target_past_a_false_optimum_within_60_images(results):
 def test_a_narrow_search_fails_more_often_as_in_table_5_1(results):
     rates = {k: (np.asarray(result.score) >= probes.THRESHOLD).mean() for k, result in results.items()}
     assert rates[0.5] < rates[1.5] - 0.1
+
+
+def test_wide_samples_leave_a_false_optimum_in_which_the_rule_of_the_thesis_stays():
+    """The view opposite to the target has a score of 0.93, from which the samples spread by 6 degrees."""
+
+    def near_symmetric(view, target):
+        false_peak = jnp.exp(-((probes.angle_between(view, probes.opposite(target)) / 0.6) ** 2))
+        return jnp.maximum(probes.two_peaks(view, target), 0.93 * false_peak)
+
+    target = probes.random_views(jax.random.key(2), 200)
+    problems = probes.search_problems(probes.opposite(target), target)
+    keys = jax.random.split(jax.random.key(0), 200)
+    found = {}
+    for num_wide in (0, 1):
+        result = run_searches(keys, problems, near_symmetric, RandomSearchConfig(num_wide=num_wide))
+        found[num_wide] = (np.asarray(result.score) >= probes.THRESHOLD).mean()
+    assert found[0] <= 0.1
+    assert found[1] >= 0.5
 
 
 def test_every_sample_lies_inside_the_band(results):
@@ -66,7 +85,7 @@ def test_scores_never_fall_and_belong_to_the_returned_view(results):
 
 def test_a_trial_gives_the_same_result_alone_and_in_a_batch(results):
     keys, args = jax.random.split(jax.random.key(0), 500), random_problems(500)
-    config = RandomSearchConfig(k=1.5)
+    config = RandomSearchConfig(k=1.5, num_wide=0)
     for i in (0, 7):
         alone = run_searches(keys[i : i + 1], jax.tree.map(lambda x, i=i: x[i : i + 1], args), probes.two_peaks, config)
         batched = jax.tree.map(lambda x, i=i: x[i], results[1.5])

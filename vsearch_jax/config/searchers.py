@@ -15,11 +15,15 @@ class RandomSearchConfig:
     """Number of views in an epoch."""
     k: float = 1.5
     """Factor k. The standard deviation of the samples is k (1 - best cosine so far), in rad."""
+    num_wide: int = 1
+    """Number of the views in an epoch that are uniform over the band instead. The thesis has none."""
     max_epochs: int = 30
     """Number of epochs after which the search gives up."""
 
     def __post_init__(self) -> None:
         require_positive(self, "num_samples", "k", "max_epochs")
+        allowed = f"from 0 to below num_samples ({self.num_samples})"
+        require(self, "num_wide", 0 <= self.num_wide < self.num_samples, allowed)
 
 
 @dataclass(frozen=True)

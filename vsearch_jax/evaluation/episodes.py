@@ -13,7 +13,7 @@ from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv, episode_of
 from vsearch_jax.evaluation.outcome import Outcome, measure_outcome
 from vsearch_jax.evaluation.step_bound import steps_lower_bound
-from vsearch_jax.search import SearchArgs, sac
+from vsearch_jax.search import POLICIES, SearchArgs, sac
 from vsearch_jax.types import Observation, TrainState
 
 if TYPE_CHECKING:
@@ -38,8 +38,10 @@ def episode_keys(key: Array, config: Config) -> tuple[Array, Array]:
 
 def evaluate_policies(
     env: ViewSearchEnv, state: TrainState, episodes: tuple[Array, Observation], grid: Observation
-) -> Outcome:
+) -> dict[str, Outcome]:
     """Runs each of the S trained policies in its E evaluation episodes, and measures how each search ended.
+
+    Each episode runs once for each kind of search by a policy: alone, and with a local search.
 
     Args:
       env: the task.
@@ -49,19 +51,30 @@ def evaluate_policies(
         the steps.
 
     Returns:
-      Measures by name, arrays [S, E]; `evaluate` describes them.
+      For each key of `vsearch_jax.search.POLICIES` the measures by name, arrays [S, E]; `evaluate` describes them.
     """
 
-    def run_episodes_of_policy(policy: tuple[nnx.State, tuple[Array, Observation]]) -> Outcome:
+    def run_episodes_of_policy(policy: tuple[nnx.State, tuple[Array, Observation]], is_assisted: Array) -> Outcome:
         actor, own_episodes = policy
-        run = functools.partial(run_episode, env=env, actor=actor, grid=grid)
+        run = functools.partial(run_episode, env=env, actor=actor, grid=grid, is_assisted=is_assisted)
         return jax.lax.map(run, own_episodes, batch_size=env.config.evaluation.batch_size)
 
-    return jax.lax.map(run_episodes_of_policy, (state.sac.actor, episodes))
+    def run_all(is_assisted: Array) -> Outcome:
+        run = functools.partial(run_episodes_of_policy, is_assisted=is_assisted)
+        return jax.lax.map(run, (state.sac.actor, episodes))
+
+    # One loop over both kinds, so that the episode is compiled once.
+    outcomes = jax.lax.map(run_all, jnp.asarray(list(POLICIES.values())))
+    return {name: jax.tree.map(lambda x, i=i: x[i], outcomes) for i, name in enumerate(POLICIES)}
 
 
 def run_episode(
-    episode: tuple[Array, Observation], *, env: ViewSearchEnv, actor: nnx.State, grid: Observation
+    episode: tuple[Array, Observation],
+    *,
+    env: ViewSearchEnv,
+    actor: nnx.State,
+    grid: Observation,
+    is_assisted: Array,
 ) -> Outcome:
     """Runs one evaluation episode of a policy, and measures how the search ended: success, steps, pose errors.
 
@@ -71,6 +84,7 @@ def run_episode(
       actor: parameters of the policy.
       grid: what the camera sees from a grid of views over the band (reachable elevations). It gives the lower bound on
         the steps.
+      is_assisted: bool[], whether a local search helps the policy.
 
     Returns:
       Measures of the episode by name; `evaluate` describes them.
@@ -84,12 +98,12 @@ def run_episode(
         threshold=jnp.asarray(env.config.env.threshold),
         task=sac.PolicyTask(actor, start),
     )
-    result = sac.search(search_key, env.step, args, env.config)
+    result, num_helped = sac.assisted.search(search_key, env.step, args, env.config, is_assisted)
     end = result.end
     assert end is not None  # the policy's search always sets it; only the black-box searchers leave it out
     last = episode_of(end.state)
     return measure_outcome(env.config, result, last.observation.camera, last.target.camera) | {
-        "num_helped": end.num_helped,
+        "num_helped": num_helped,
         "joint_travel": end.travel,
         "motion_time": end.duration,
         "num_plans": result.evaluations,

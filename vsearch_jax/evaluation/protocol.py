@@ -19,7 +19,7 @@ from vsearch_jax.evaluation.step_bound import band_grid
 from vsearch_jax.evaluation.trials import search_trials
 from vsearch_jax.evaluation.views import ViewRequest, initial_views, observe_request, protocol_target
 from vsearch_jax.geometry import cosine_similarity
-from vsearch_jax.search import cma_es, random_search
+from vsearch_jax.search import BLACK_BOX
 from vsearch_jax.types import Observation, ReachabilityMap, TrainState
 from vsearch_jax.xla.batching import map_in_batches
 
@@ -34,8 +34,9 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
       config: the config of the training. `evaluation` may differ. In `env`, `reachable` and `motion` may differ.
 
     Returns:
-      Measures by name, for each searcher. For `random_search` and `cma_es` arrays of [trials]; a trial is one search.
-      Each initial view has `num_runs` trials in a row. For `sac` arrays of [policy seeds, episodes]. The arrays:
+      Measures by name, for each searcher of `vsearch_jax.search.LABELS`. For black-box searchers arrays of [trials]; a
+      trial is one search. Each initial view has `num_runs` trials in a row. For `sac` (the policies alone) and
+      `sac_assisted` (the same episodes with a local search) arrays of [policy seeds, episodes]. The arrays:
 
       - `is_success` bool: the final cosine meets the threshold.
       - `evaluations` i32: images taken.
@@ -48,8 +49,10 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
       - `joint_travel` f32 rad and `motion_time` f32 s, sums over all motions.
       - `num_plans` i32: motions requested. Each image but that of the initial view needs one.
       - `initial_view` and `target_view`: View of f32 rad.
-      - for `sac` also `steps_lower_bound` i32, see `steps_lower_bound`; and `num_helped` i32, steps that were not the
-        policy's.
+      - `num_wide` i32 of `random_search`: how often a wide sample became the best view.
+      - `num_restarts` i32 of `cma_es_restarts`.
+      - `steps_lower_bound` i32 of the policies, see `steps_lower_bound`; and `num_helped` i32, steps that the local
+        search chose.
 
     Raises:
       ConfigError: the arm cannot reach the target view, or reaches no elevation at every azimuth.
@@ -89,23 +92,23 @@ def check_target(reach: ReachabilityMap, config: Config) -> None:
 def _evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
     env = ViewSearchEnv(config, state.encoder, state.reach)
     key = jax.random.fold_in(state.key, 2**31 - 1)  # a salt that training does not use
-    known_views_key, random_search_key, cma_es_key, sac_key = jax.random.split(key, 4)
+    known_views_key, search_key, policy_key = jax.random.split(key, 3)
 
-    reset_keys, search_keys = episode_keys(sac_key, config)
+    reset_keys, search_keys = episode_keys(policy_key, config)
     initial, grid, target, ends = observe_known_views(known_views_key, reset_keys, env, config)
     similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(initial.code, target.code)
     # The code of an initial view that the arm cannot reach is all zeros.
     starts = (initial, jnp.where(jnp.any(initial.code != 0.0, axis=-1), similarity, -jnp.inf))
 
-    methods = (random_search.method(config.random_search), cma_es.method(config.cma_es))
-    trials = search_trials(jnp.stack([random_search_key, cma_es_key]), env, methods, starts, target)
+    methods = tuple(build(config) for build in BLACK_BOX.values())
+    trials = search_trials(jax.random.split(search_key, len(methods)), env, methods, starts, target)
     target_views = jax.tree.map(lambda x: jnp.broadcast_to(x, starts[1].shape), target.view)
     measure_trials = jax.vmap(measure_outcome, in_axes=(None, 0, 0, None))
     outcomes: dict[str, Outcome] = {}
-    for name, (result, motions, camera) in zip(("random_search", "cma_es"), trials, strict=True):
+    for name, (result, motions, counts, camera) in zip(BLACK_BOX, trials, strict=True):
         measured: Outcome = measure_trials(config, result, camera, target.camera)
-        outcomes[name] = measured | motions | {"initial_view": initial.view, "target_view": target_views}
-    return outcomes | {"sac": evaluate_policies(env, state, (search_keys, ends), grid)}
+        outcomes[name] = measured | motions | counts | {"initial_view": initial.view, "target_view": target_views}
+    return outcomes | evaluate_policies(env, state, (search_keys, ends), grid)
 
 
 class KnownViews(NamedTuple):

@@ -13,7 +13,7 @@ from brax.envs.base import State
 from jax import Array
 
 from vsearch_jax.config import Config
-from vsearch_jax.env import ViewSearchEnv, episode_of, obs_of
+from vsearch_jax.env import ViewSearchEnv, episode_of
 from vsearch_jax.evaluation.views import ViewRequest, observe_request, protocol_target
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search import sac
@@ -47,7 +47,7 @@ def record_search(state: TrainState, config: Config) -> dict[str, Array]:
     start = start_episode(env, opposite_start(env, state.key))
 
     def step(now: State) -> tuple[State, None]:
-        return env.step(now, mean_action(actor, now, config)), None
+        return env.step(now, sac.mean_action(actor, now, config)), None
 
     def render_wrist(qpos: Array) -> Array:
         return env.wrist_image(qpos)[1].rgb
@@ -65,20 +65,6 @@ def record_search(state: TrainState, config: Config) -> dict[str, Array]:
 def first_actor(state: TrainState) -> nnx.State:
     """Returns the parameters of the run's first policy. A run trains one policy for each policy seed."""
     return jax.tree.map(lambda x: x[0], state.sac.actor)
-
-
-def mean_action(actor: nnx.State, state: State, config: Config) -> Array:
-    """Returns the deterministic action (tanh of the mean) that a policy takes in a brax State.
-
-    Args:
-      actor: parameters of the policy.
-      state: brax State of one episode.
-      config: the run's config; `sac` is read.
-
-    Returns:
-      Action f32[2] in [-1, 1]: change of azimuth and elevation in units of `env.action_scale_deg`.
-    """
-    return sac.act(None, actor, obs_of(state), config.sac)
 
 
 def opposite_start(env: ViewSearchEnv, key: Array) -> ViewRequest:

@@ -25,11 +25,13 @@ class TrialResults(NamedTuple):
     Attributes:
       result: best view, score and number of images of each trial.
       motions: cost of each trial's motions: `joint_travel` f32[N] rad, `motion_time` f32[N] s, `num_plans` i32[N].
+      counts: the searcher's own counts by name, i32[N] each; see `Method.counts`.
       camera: camera in world at the best view of each trial.
     """
 
     result: SearchResult
     motions: dict[str, Array]
+    counts: dict[str, Array]
     camera: Camera
 
 
@@ -105,7 +107,7 @@ def search_trials(
         result = jax.vmap(to_result)(method.record(states))
         # The image of the initial view needs no motion.
         motions = {"joint_travel": costs[:, 0], "motion_time": costs[:, 1], "num_plans": result.evaluations - 1}
-        results.append(TrialResults(result, motions, camera))
+        results.append(TrialResults(result, motions, jax.vmap(method.counts)(states), camera))
     return results
 
 

@@ -15,11 +15,12 @@ from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv, episode_of
-from vsearch_jax.evaluation.recording import first_actor, mean_action, opposite_start, roll_out, start_episode
+from vsearch_jax.evaluation.recording import first_actor, opposite_start, roll_out, start_episode
 from vsearch_jax.evaluation.views import ViewRequest
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Trajectory, duration, state_at
 from vsearch_jax.planning.execution import pass_through
+from vsearch_jax.search import sac
 from vsearch_jax.types import Camera, Observation, TrainState, View
 from vsearch_jax.xla.batching import map_in_batches
 
@@ -100,7 +101,7 @@ def record_motions(state: TrainState, key: Array | None, config: Config) -> Film
 
     def step(now: State) -> tuple[State, tuple[Array, Array]]:
         here = episode_of(now).observation.qpos
-        view = env.commanded_view(now, mean_action(actor, now, config))
+        view = env.commanded_view(now, sac.mean_action(actor, now, config))
         goal, is_solved = env.solve_joints(view, here)
         trajectory, motion = env.plan_motion(here, goal)
         motion = motion._replace(is_found=motion.is_found & is_solved)

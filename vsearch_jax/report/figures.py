@@ -12,8 +12,9 @@ from matplotlib.patches import Patch
 
 from vsearch_jax.config import Config
 from vsearch_jax.report.style import COLORS, INK, REACHABLE, THESIS_COLOR, UNREACHABLE, styled
-from vsearch_jax.report.summary import SEARCHERS, Results, Trials
+from vsearch_jax.report.summary import Results, Trials
 from vsearch_jax.report.thesis import thesis_range
+from vsearch_jax.search import LABELS
 from vsearch_jax.types import ReachabilityMap
 
 THESIS_BAND_DEG = (40, 70)
@@ -118,7 +119,7 @@ def draw_search_progress(name: str, trials: Trials, num_samples: int, threshold:
     """Draws a searcher's progress over the number of images: best cosine of each trial, share of successful trials.
 
     Args:
-      name: the searcher, "random_search" or "cma_es".
+      name: the searcher, a key of `vsearch_jax.search.BLACK_BOX`.
       trials: measures of this searcher from `evaluate`, arrays with one entry for each of N trials (searches).
       num_samples: number of images of a generation (images that the searcher asks for at once).
       threshold: cosine at which a search ends.
@@ -132,19 +133,19 @@ def draw_search_progress(name: str, trials: Trials, num_samples: int, threshold:
         upper.plot(images[:end], scores[:end], color=COLORS[name], alpha=0.2, linewidth=0.9)
     upper.plot(images, np.median(best, axis=0), color=INK, label="median")
     upper.axhline(threshold, color=INK, linestyle=":", linewidth=1.2, label=f"threshold {threshold:g}")
-    low, high = thesis_range(name, "evaluations_mean")
-    label = f"thesis: {low:g}–{high:g} images, mean"
-    for axes in (upper, lower):
-        axes.axvspan(low, high, color=THESIS_COLOR, alpha=0.25, linewidth=0, label=label)
+    if (of_thesis := thesis_range(name, "evaluations_mean")) is not None:
+        label = f"thesis: {of_thesis[0]:g}–{of_thesis[1]:g} images, mean"
+        for axes in (upper, lower):
+            axes.axvspan(*of_thesis, color=THESIS_COLOR, alpha=0.25, linewidth=0, label=label)
     mean = evaluations.mean()
     upper.axvline(mean, color=COLORS[name], linestyle="--", label=f"ours: {mean:.1f} images, mean")
-    upper.set(ylabel="best cosine so far", title=f"{SEARCHERS[name]}: {len(best)} trials")
+    upper.set(ylabel="best cosine so far", title=f"{LABELS[name]}: {len(best)} trials")
     upper.legend(loc="lower right")
     ends = np.sort(evaluations[trials["is_success"]])
     share = 100.0 * np.arange(1, len(ends) + 1) / len(best)
     lower.step([0, *ends, images[-1]], [0, *share, share[-1] if len(share) else 0], where="post", color=COLORS[name])
-    success_rate, _ = thesis_range(name, "success_rate")
-    lower.axhline(100 * success_rate, color=THESIS_COLOR, linestyle="--", linewidth=1.2)
+    if (of_thesis := thesis_range(name, "success_rate")) is not None:
+        lower.axhline(100 * of_thesis[0], color=THESIS_COLOR, linestyle="--", linewidth=1.2)
     lower.set(xlabel="images taken", ylabel="found (%)", ylim=(0, 105), xlim=(0, images[-1]))
     return figure
 
@@ -163,16 +164,23 @@ def draw_policy_episodes(trials: Trials) -> Figure:
     share = [100.0 * np.bincount(x, minlength=numbers[-1] + 1)[1:] / x.size for x in (steps, bound)]
     counts.bar(numbers - 0.2, share[0], 0.4, color=COLORS["sac"], label=f"ours, mean {steps.mean():.2f}")
     counts.bar(numbers + 0.2, share[1], 0.4, color="#b9d8cd", label=f"lower bound, mean {bound.mean():.2f}")
-    thesis_mean, _ = thesis_range("sac", "evaluations_mean")
+    thesis_mean = _thesis_mean("evaluations_mean")
     counts.axvline(thesis_mean, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis_mean:g}")
     title = f"{steps.size} episodes, random views and targets"
     counts.set(xlabel="steps of an episode", ylabel="episodes (%)", title=title)
     counts.legend(loc="upper right")
     degrees, centimetres = np.rad2deg(trials["rotation_error"]).ravel(), 100 * trials["translation_error"].ravel()
-    _plot_errors(rotation, degrees, "rotational error (°)", "°", thesis_range("sac", "rotation_error_deg_mean")[0])
-    thesis_mean, _ = thesis_range("sac", "translation_error_cm_mean")
+    _plot_errors(rotation, degrees, "rotational error (°)", "°", _thesis_mean("rotation_error_deg_mean"))
+    thesis_mean = _thesis_mean("translation_error_cm_mean")
     _plot_errors(translation, centimetres, "translational error (cm)", " cm", thesis_mean)
     return figure
+
+
+def _thesis_mean(key: str) -> float:
+    """Returns the thesis's mean of a measure of its policy."""
+    value = thesis_range("sac", key)
+    assert value is not None  # the thesis gives all measures that are drawn
+    return value[0]
 
 
 def _plot_errors(axes: Axes, errors: np.ndarray, label: str, unit: str, thesis_mean: float) -> None:
@@ -194,25 +202,29 @@ def draw_comparison(results: Results) -> Figure:
       results: content of `results.json`.
     """
     panels = {
-        "success_rate": ("success (%)", 100.0),
+        "pose_success_rate": ("pose success (%)", 100.0),
+        "success_rate": ("success by cosine (%)", 100.0),
         "evaluations_mean": ("images or steps, mean", 1.0),
         "rotation_error_deg_mean": ("rotational error, mean (°)", 1.0),
         "translation_error_cm_mean": ("translational error, mean (cm)", 1.0),
     }
-    figure = Figure(figsize=(11, 3.4))
+    figure = Figure(figsize=(14, 3.8))
     for axes, (key, (label, scale)) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
-        for position, name in enumerate(SEARCHERS):
+        for position, name in enumerate(LABELS):
             ours, interval = scale * results[name][key], results[name][f"{key}_ci95"]
             axes.bar(position - 0.2, ours, 0.38, color=COLORS[name])
             if interval is not None:
                 _plot_interval(axes, position - 0.2, scale * np.array(interval))
-            low, high = (scale * value for value in thesis_range(name, key))
+            of_thesis = thesis_range(name, key)
+            if of_thesis is None:
+                continue
+            low, high = (scale * value for value in of_thesis)
             middle = 0.5 * (low + high)
             axes.bar(position + 0.2, middle, 0.38, color=THESIS_COLOR, alpha=0.5, hatch="///", edgecolor="white")
             if low < high:
                 _plot_interval(axes, position + 0.2, np.array([low, high]))
-        axes.set_xticks(range(len(SEARCHERS)), ["random", "CMA-ES", "SAC"])
-        axes.set(title=label)
+        axes.set_xticks(range(len(LABELS)), LABELS.values(), rotation=40, ha="right")
+        axes.set_title(label, fontsize=10)
         axes.grid(axis="x", visible=False)
     figure.supxlabel("coloured: ours with 95 % intervals; hatched: thesis, with its range if it gives one", fontsize=9)
     return figure

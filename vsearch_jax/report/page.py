@@ -14,17 +14,17 @@ from matplotlib.figure import Figure
 from vsearch_jax.config import Config
 from vsearch_jax.report import figures
 from vsearch_jax.report.style import styled
-from vsearch_jax.report.summary import SEARCHERS, Results, summarize_results, to_trials
+from vsearch_jax.report.summary import Results, false_positive_warning, summarize_results, to_trials
 from vsearch_jax.report.table import FOOTNOTE, describe_motion, table_rows
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.loop import Evaluated
+from vsearch_jax.search import BLACK_BOX, LABELS
 
 CAPTIONS = {
     "search": "One search by the policy; it starts behind the object",
     "comparison": "Comparison of the searchers",
-    "random_search": "Random search",
-    "cma_es": "CMA-ES",
-    "sac_evaluation": "Soft actor-critic, evaluation",
+    **{name: LABELS[name] for name in BLACK_BOX},
+    "sac_evaluation": "SAC policy alone, evaluation",
     "training": "Training",
     "reachability": "Reachable views",
 }
@@ -65,9 +65,9 @@ def draw_figures(results: Results, evaluated: Evaluated, config: Config) -> dict
     """
     trials = {name: to_trials(outcome) for name, outcome in evaluated.arrays.items()}
     search, threshold = evaluated.search, config.env.threshold
-    num_samples = {"random_search": config.random_search.num_samples, "cma_es": config.cma_es.population}
     progress = {
-        name: figures.draw_search_progress(name, trials[name], num_samples[name], threshold) for name in num_samples
+        name: figures.draw_search_progress(name, trials[name], build(config).num_views, threshold)
+        for name, build in BLACK_BOX.items()
     }
     shown = slice(0, int(search["num_steps"]) + 1)
     cosines = search["similarity"][shown].tolist()
@@ -122,7 +122,8 @@ def _render_page(title: str, results: Results, images: Mapping[str, bytes], conf
     pictures = [(CAPTIONS[name], base64.b64encode(image).decode()) for name, image in images.items()]
     return template.render(
         title=title,
-        searchers=SEARCHERS.values(),
+        searchers=LABELS.values(),
+        warning=false_positive_warning(results),
         rows=table_rows(results),
         footnote=FOOTNOTE,
         motion=describe_motion(results),

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import matplotlib as mpl
 
-COLORS = {"random_search": "#3b6fb6", "cma_es": "#d1812c", "sac": "#2e8b6f"}
+COLORS = {
+    "random_search": "#3b6fb6",
+    "cma_es": "#d1812c",
+    "cma_es_restarts": "#a8481f",
+    "sac": "#2e8b6f",
+    "sac_assisted": "#76a92c",
+}
 """Colour of each searcher."""
 THESIS_COLOR = "#8a8f98"
 INK = "#23272e"

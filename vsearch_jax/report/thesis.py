@@ -37,16 +37,18 @@ THESIS: dict[str, dict[str, float | list[float]]] = {
 }
 
 
-def thesis_range(searcher: str, key: str) -> tuple[float, float]:
+def thesis_range(searcher: str, key: str) -> tuple[float, float] | None:
     """Returns the thesis's published value of one measure as (lowest, highest). A single value is returned twice.
 
     Args:
-      searcher: the searcher, for example "sac"; a key of `THESIS`.
+      searcher: the searcher, for example "sac"; a key of `results.json`.
       key: the measure, for example "success_rate"; a key of `results.json`.
 
-    Raises:
-      KeyError: the thesis does not give the value.
+    Returns:
+      The range, or None where the thesis gives no value.
     """
-    value = THESIS[searcher][key]
+    value = THESIS.get(searcher, {}).get(key)
+    if value is None:
+        return None
     low, high = value if isinstance(value, list) else (value, value)
     return low, high

@@ -1,6 +1,6 @@
 """Searchers that look for the view of a target image.
 
-The black-box searchers `random_search` and `cma_es` share one signature:
+The black-box searchers `random_search`, `cma_es` and `cma_es_restarts` share one signature:
 
     search(key, score_fn, args, config) -> SearchResult
 
@@ -12,9 +12,23 @@ for callers that take the images themselves.
 
 `sac` holds soft actor-critic. Its `search` has the signature above, with the environment's step function in place of
 `score_fn`.
+
+`BLACK_BOX`, `POLICIES` and `LABELS` are the table of searchers that evaluation and report read.
 """
 
-from vsearch_jax.search import cma_es, random_search, sac
+from vsearch_jax.search import cma_es, cma_es_restarts, random_search, sac
 from vsearch_jax.search.common import Method, ScoreFn, SearchArgs
+from vsearch_jax.search.table import BLACK_BOX, LABELS, POLICIES
 
-__all__ = ["Method", "ScoreFn", "SearchArgs", "cma_es", "random_search", "sac"]
+__all__ = [
+    "BLACK_BOX",
+    "LABELS",
+    "POLICIES",
+    "Method",
+    "ScoreFn",
+    "SearchArgs",
+    "cma_es",
+    "cma_es_restarts",
+    "random_search",
+    "sac",
+]

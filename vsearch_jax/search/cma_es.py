@@ -1,4 +1,4 @@
-"""CMA-ES over azimuth and elevation (thesis 4.2) with evosax, plus bounds and restarts.
+"""CMA-ES over azimuth and elevation (thesis 4.2) with evosax: the strategy as published, with bounds.
 
 evosax 0.3.2 follows Hansen's tutorial (arXiv 1604.00772) and uses its parameters of 2016. Its generation counter is one
 too high in the stall indicator h_sigma (tutorial, page 28). Therefore the counter starts at -1 here. With that
@@ -35,22 +35,16 @@ from vsearch_jax.search.common import (
     start_record,
 )
 from vsearch_jax.types import SearchResult, View
-from vsearch_jax.xla.tree import tree_where
 
-# One unit of the search space is 90 degrees of azimuth, or half the height of the band.
-_AZIMUTH_UNIT = math.pi / 2.0
+AZIMUTH_UNIT = math.pi / 2.0
+"""One unit of the search space is 90 degrees of azimuth, or half the height of the band."""
 # Above the fitness of reachable views. 1 - cosine is at most 2; the rest leaves room for the bound penalty.
 _UNREACHABLE_FITNESS = 5.0
 # Fitness for each squared unit outside the band.
 _BOUND_PENALTY = 1.0
-# Smallest and largest sigma in rad of azimuth, for each unit of missing cosine. 1.5 is the k of random search.
-_SIGMA_RANGE = (1.5, 9.0)
-# The search restarts after this number of generations whose best fitness improves by less than _MIN_IMPROVEMENT.
-_STALL_GENERATIONS = 6
-_MIN_IMPROVEMENT = 3e-3
 
 
-class _Algorithm(NamedTuple):
+class Algorithm(NamedTuple):
     """evosax's CMA-ES and its parameters."""
 
     cma_es: CMA_ES
@@ -58,43 +52,30 @@ class _Algorithm(NamedTuple):
 
 
 @flax.struct.dataclass
-class _State:
+class CMAESState:
     """State of the search; N is the population size. Points are in units of the search space.
 
     Attributes:
-      record: Record.
+      record: what the search has found.
       strategy: evosax's state: mean, sigma, covariance and evolution paths.
       population: f32[N, 2], points of the last generation.
-      run_fitness: f32[], best fitness since the last restart at a random point.
-      run_point: f32[2], point with that fitness.
-      stalled: i32[], number of generations since `run_fitness` improved.
     """
 
     record: Record
     strategy: Strategy
     population: Array
-    run_fitness: Array
-    run_point: Array
-    stalled: Array
 
 
 def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: CMAESConfig) -> SearchResult:
     """Searches the view sphere with CMA-ES for the view with the best score.
 
-    The search starts at the initial view and restarts where it stalls. A generation is the set of views (samples) whose
-    images are taken before the strategy adapts. The fitness of a sample is 1 - cosine; lower is better. Azimuth is
-    periodic and has no bounds. A sample outside the band (the elevations to search) is moved to the band's nearer end.
-    The sample's squared distance to the band is added to the fitness (Hansen's boundary handling with a fixed weight).
+    The search starts at the initial view. A generation is the set of views (samples) whose images are taken before the
+    strategy adapts. The fitness of a sample is 1 - cosine; lower is better. Azimuth is periodic and has no bounds. A
+    sample outside the band (the elevations to search) is moved to the band's nearer end. The sample's squared distance
+    to the band is added to the fitness (Hansen's boundary handling with a fixed weight).
 
-    Far from the target the cosine is nearly flat and has local optima. The plain strategy would converge to them. These
-    rules prevent it:
-
-    - Sigma stays between 1.5 and 9 rad for each unit of missing cosine, and never exceeds the initial sigma. If it is
-      too small, it is raised. If it is too large, the strategy restarts at the best view of the present run.
-    - After 6 generations without improvement, a new run starts at a random view.
-
-    The record keeps the best view of all runs. The search ends at the threshold or after `config.max_generations`. If
-    the initial view meets the threshold, the search takes one image only.
+    The search ends at the threshold or after `config.max_generations`. If the initial view meets the threshold, the
+    search takes one image only.
 
     Args:
       key: PRNG key.
@@ -109,15 +90,11 @@ def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: 
     return run_search(key, score_fn, args, method(config))
 
 
-def method(config: CMAESConfig) -> Method[_State]:
+def method(config: CMAESConfig) -> Method[CMAESState]:
     """Returns CMA-ES in parts (start, ask, tell, record), for a caller that takes the images itself."""
-    sigma = math.radians(config.sigma_deg) / _AZIMUTH_UNIT
-    cma_es = CMA_ES(population_size=config.population, solution=jnp.zeros(2))
-    with _evosax_promotion():
-        params = dataclasses.replace(cma_es.default_params, std_init=jnp.asarray(sigma, jnp.float32))
-    algorithm = _Algorithm(cma_es, params)
+    algorithm = build_algorithm(config)
     return Method(
-        start=functools.partial(_init_state, algorithm, config),
+        start=functools.partial(init_state, algorithm, config),
         ask=functools.partial(_sample_views, algorithm),
         tell=functools.partial(_update_state, algorithm),
         record=lambda state: state.record,
@@ -125,93 +102,130 @@ def method(config: CMAESConfig) -> Method[_State]:
     )
 
 
-def _init_state(algorithm: _Algorithm, config: CMAESConfig, args: SearchArgs[object], score: Array) -> _State:
-    return _State(
+def build_algorithm(config: CMAESConfig) -> Algorithm:
+    """Returns evosax's CMA-ES for two unknowns, with the population and the initial sigma of `config`."""
+    sigma = math.radians(config.sigma_deg) / AZIMUTH_UNIT
+    cma_es = CMA_ES(population_size=config.population, solution=jnp.zeros(2))
+    with evosax_promotion():
+        params = dataclasses.replace(cma_es.default_params, std_init=jnp.asarray(sigma, jnp.float32))
+    return Algorithm(cma_es, params)
+
+
+def init_state(algorithm: Algorithm, config: CMAESConfig, args: SearchArgs[object], score: Array) -> CMAESState:
+    """Returns the state at the start of a search: the mean of the strategy is the initial view.
+
+    Args:
+      algorithm: from `build_algorithm`.
+      config: settings of CMA-ES.
+      args: the search problem.
+      score: f32[], score of the initial view.
+    """
+    return CMAESState(
         record=start_record(args.initial, score, config.max_generations),
-        strategy=_init_strategy(algorithm, _to_point(args.initial, args.band)),
+        strategy=init_strategy(algorithm, to_point(args.initial, args.band)),
         population=jnp.zeros((config.population, 2)),
-        run_fitness=jnp.float32(jnp.inf),
-        run_point=_to_point(args.initial, args.band),
-        stalled=jnp.int32(0),
     )
 
 
-def _generation_keys(key: Array, state: _State) -> tuple[Array, Array]:
-    """Returns the present generation's keys of the samples and of a restart."""
-    sample_key, restart_key = jax.random.split(jax.random.fold_in(key, state.record.generation))
-    return sample_key, restart_key
+def sample_population(algorithm: Algorithm, key: Array, strategy: Strategy) -> tuple[Array, Strategy]:
+    """Draws a generation: N points f32[N, 2] in units of the search space. Returns the strategy to go on with too.
+
+    Args:
+      algorithm: from `build_algorithm`.
+      key: PRNG key of this generation.
+      strategy: evosax's state.
+    """
+    with evosax_promotion():
+        return algorithm.cma_es.ask(key, strategy, algorithm.params)
 
 
-def _sample_views(algorithm: _Algorithm, key: Array, args: SearchArgs[object], state: _State) -> tuple[View, _State]:
-    with _evosax_promotion():
-        sample_key, _ = _generation_keys(key, state)
-        population, strategy = algorithm.cma_es.ask(sample_key, state.strategy, algorithm.params)
-    views, _ = jax.vmap(_to_view, in_axes=(0, None))(population, args.band)
+def update_strategy(
+    algorithm: Algorithm, key: Array, strategy: Strategy, population: Array, fitness: Array
+) -> Strategy:
+    """Adapts mean, sigma and covariance to the fitness of a generation of N points.
+
+    Args:
+      algorithm: from `build_algorithm`.
+      key: PRNG key, which evosax requires.
+      strategy: evosax's state that `sample_population` returned.
+      population: f32[N, 2], points of the generation, in units of the search space.
+      fitness: f32[N], fitness of the points; lower is better.
+    """
+    with evosax_promotion():
+        return algorithm.cma_es.tell(key, population, fitness, strategy, algorithm.params)[0]
+
+
+def fitness_of(population: Array, scores: Array, band: Array) -> Array:
+    """Computes the fitness f32[N] of N points: 1 - score, plus the squared distance to the band.
+
+    Args:
+      population: f32[N, 2], points in units of the search space.
+      scores: f32[N], scores of the points' views; -inf where the arm cannot reach a view, whose fitness is 5.
+      band: f32[2] rad, lowest and highest elevation of the search.
+    """
+    _, excess = jax.vmap(to_view, in_axes=(0, None))(population, band)
+    return jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2
+
+
+def _sample_views(
+    algorithm: Algorithm, key: Array, args: SearchArgs[object], state: CMAESState
+) -> tuple[View, CMAESState]:
+    key = jax.random.fold_in(key, state.record.generation)
+    population, strategy = sample_population(algorithm, key, state.strategy)
+    views, _ = jax.vmap(to_view, in_axes=(0, None))(population, args.band)
     return views, dataclasses.replace(state, strategy=strategy, population=population)
 
 
 def _update_state(
-    algorithm: _Algorithm, key: Array, args: SearchArgs[object], state: _State, views: View, scores: Array
-) -> _State:
-    """Returns the state after the strategy's update and the restart rules of `search`."""
-    params, population = algorithm.params, state.population
-    sample_key, restart_key = _generation_keys(key, state)
-    _, excess = jax.vmap(_to_view, in_axes=(0, None))(population, args.band)
-    fitness = jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2
-    with _evosax_promotion():
-        strategy, _ = algorithm.cma_es.tell(sample_key, population, fitness, state.strategy, params)
-    best = jnp.argmin(fitness)
-    stalled = jnp.where(fitness[best] < state.run_fitness - _MIN_IMPROVEMENT, 0, state.stalled + 1)
-    is_stalled = stalled >= _STALL_GENERATIONS
-    run_point = jax.lax.select(fitness[best] < state.run_fitness, population[best], state.run_point)
-    run_fitness = jnp.minimum(fitness[best], state.run_fitness)
-    random_point = jax.random.uniform(restart_key, (2,), minval=jnp.array([-2.0, -1.0]), maxval=jnp.array([2.0, 1.0]))
-
-    largest_axis = jnp.sqrt(jnp.linalg.eigvalsh(strategy.C)[-1])
-    floor, ceiling = (jnp.minimum(k * run_fitness / _AZIMUTH_UNIT, params.std_init) for k in _SIGMA_RANGE)
-    is_too_wide = strategy.std * largest_axis > ceiling
-    strategy = dataclasses.replace(strategy, std=jnp.maximum(strategy.std, floor / largest_axis))
-    restarted = _init_strategy(algorithm, jnp.where(is_stalled, random_point, run_point))
-    restarted = dataclasses.replace(restarted, std=jnp.where(is_stalled, params.std_init, ceiling))
+    algorithm: Algorithm, key: Array, args: SearchArgs[object], state: CMAESState, views: View, scores: Array
+) -> CMAESState:
+    fitness = fitness_of(state.population, scores, args.band)
     return dataclasses.replace(
         state,
         record=add_generation(state.record, views, scores, args.threshold),
-        strategy=tree_where(is_stalled | is_too_wide, restarted, strategy),
-        run_fitness=jnp.where(is_stalled, jnp.inf, run_fitness),
-        run_point=run_point,
-        stalled=jnp.where(is_stalled, 0, stalled),
+        strategy=update_strategy(algorithm, key, state.strategy, state.population, fitness),
     )
 
 
 @contextlib.contextmanager
-def _evosax_promotion() -> Iterator[None]:
+def evosax_promotion() -> Iterator[None]:
     """Allows the promotion of types and ranks that evosax relies on, even if JAX is set to refuse it."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
-def _init_strategy(algorithm: _Algorithm, mean: Array) -> Strategy:
-    """Returns a fresh strategy with mean `mean` (f32[2] units) and the initial sigma."""
-    with _evosax_promotion():
+def init_strategy(algorithm: Algorithm, mean: Array) -> Strategy:
+    """Returns a fresh strategy: mean `mean` (f32[2], in units of the search space) and the initial sigma."""
+    with evosax_promotion():
         # evosax requires a key here, but draws nothing from it.
         strategy = algorithm.cma_es.init(jax.random.key(0), mean, algorithm.params)
     return dataclasses.replace(strategy, generation_counter=jnp.int32(-1))
 
 
-def _to_point(view: View, band: Array) -> Array:
-    """Returns f32[2], the point of the search space for `view`."""
+def to_point(view: View, band: Array) -> Array:
+    """Converts a view to its point of the search space, f32[2] in units of that space.
+
+    Args:
+      view: the view, f32[] rad.
+      band: f32[2] rad, lowest and highest elevation of the search.
+    """
     middle, half = jnp.mean(band), _half_height(band)
-    return jnp.stack([view.azimuth / _AZIMUTH_UNIT, (view.elevation - middle) / half])
+    return jnp.stack([view.azimuth / AZIMUTH_UNIT, (view.elevation - middle) / half])
 
 
-def _to_view(point: Array, band: Array) -> tuple[View, Array]:
-    """Returns the view inside the band that is nearest to `point` (f32[2] units), and the distance f32[] units to it.
+def to_view(point: Array, band: Array) -> tuple[View, Array]:
+    """Converts a point of the search space to the nearest view inside the band.
 
-    The distance has a sign: it is negative below the band.
+    Args:
+      point: f32[2], in units of the search space.
+      band: f32[2] rad, lowest and highest elevation of the search.
+
+    Returns:
+      The view; and the distance f32[] in units from the point to the band, negative below the band.
     """
     inside = jnp.clip(point[1], -1.0, 1.0)
     elevation = jnp.clip(jnp.mean(band) + inside * _half_height(band), band[0], band[1])
-    return View(azimuth=wrap_angle(point[0] * _AZIMUTH_UNIT), elevation=elevation), point[1] - inside
+    return View(azimuth=wrap_angle(point[0] * AZIMUTH_UNIT), elevation=elevation), point[1] - inside
 
 
 def _half_height(band: Array) -> Array:

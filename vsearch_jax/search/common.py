@@ -76,6 +76,8 @@ class Method(NamedTuple, Generic[SearchState]):
       tell: (key, args, state, views, scores f32[N]) -> state. `state` is the state that `ask` returned.
       record: state -> Record.
       num_views: number of views in a generation.
+      counts: state -> i32[] by name: how often the searcher did what the thesis's searcher does not, for example
+        `num_restarts`.
     """
 
     start: Callable[[SearchArgs[object], Array], SearchState]
@@ -83,6 +85,7 @@ class Method(NamedTuple, Generic[SearchState]):
     tell: Callable[[Array, SearchArgs[object], SearchState, View, Array], SearchState]
     record: Callable[[SearchState], Record]
     num_views: int
+    counts: Callable[[SearchState], dict[str, Array]] = lambda state: {}
 
 
 def run_search(

@@ -1,16 +1,19 @@
-"""Soft actor-critic with goal relabelling: networks, update, replay buffer, relabelling and the search by a policy."""
+"""Soft actor-critic with goal relabelling: networks, update, replay buffer, relabelling, and searches by a policy."""
 
+from vsearch_jax.search.sac import assisted
 from vsearch_jax.search.sac.agent import act, init, td_target, update
-from vsearch_jax.search.sac.policy import PolicyTask, search
+from vsearch_jax.search.sac.policy import PolicyTask, mean_action, search
 from vsearch_jax.search.sac.relabel import relabel
 from vsearch_jax.search.sac.replay import init_replay, insert, sample_batch
 
 __all__ = [
     "PolicyTask",
     "act",
+    "assisted",
     "init",
     "init_replay",
     "insert",
+    "mean_action",
     "relabel",
     "sample_batch",
     "search",
