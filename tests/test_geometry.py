@@ -85,3 +85,32 @@ def test_cosine_similarity_of_a_zero_code_is_zero_with_a_finite_gradient() -> No
     assert float(geometry.cosine_similarity(code, zero)) == 0.0
     assert np.isfinite(jax.grad(geometry.cosine_similarity)(zero, code)).all()
     np.testing.assert_allclose(geometry.cosine_similarity(code, 3.0 * code), 1.0, rtol=1e-6)
+
+
+ANY_ANGLE = st.floats(-20.0, 20.0, width=32)
+
+
+@given(ANY_ANGLE, st.floats(0.0, 1.0, width=32), st.floats(0.0, 0.5, width=32))
+def test_an_elevation_is_reflected_into_the_band(elevation, low, height):
+    band = jnp.asarray([low, low + height], jnp.float32)
+    folded = geometry.fold_into_band(jnp.asarray(elevation, jnp.float32), band)
+    assert float(band[0]) <= float(folded) <= float(band[1])
+    np.testing.assert_allclose(geometry.fold_into_band(folded, band), folded, atol=1e-5)
+    if height > 0.1:
+        # Reflection keeps the cosine of the phase.
+        phase = np.pi * (elevation - low) / height
+        phase_folded = np.pi * (float(folded) - low) / height
+        assert np.cos(phase_folded) == pytest.approx(np.cos(phase), abs=2e-3)
+
+
+@pytest.mark.parametrize("order", [2, 5, 0])
+def test_the_turn_of_a_symmetric_object_brings_the_rotations_as_near_as_the_best_of_all_turns(order):
+    first, second = (Rotation.random(20, random_state=seed) for seed in (1, 2))
+    turn = geometry.symmetric_turn(*(jnp.float32(x.as_matrix()) for x in (first, second)), order)
+    turned = geometry.turn_about_z(turn) @ jnp.float32(second.as_matrix())
+    ours = geometry.rotation_error(jnp.float32(first.as_matrix()), turned)
+    turns = np.linspace(0.0, 2.0 * np.pi, order or 3600, endpoint=False)
+    angles = [(first.inv() * Rotation.from_euler("z", angle) * second).magnitude() for angle in turns]
+    np.testing.assert_allclose(ours, np.min(angles, axis=0), atol=2e-3)
+    if order:
+        np.testing.assert_allclose(np.round(turn / turns[1]), turn / turns[1], atol=1e-4)

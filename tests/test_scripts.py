@@ -12,6 +12,7 @@ import matplotlib.image
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 import vsearch_jax as vs
 from samples import fast_run
@@ -161,3 +162,19 @@ def test_the_example_renders_a_camera(monkeypatch: pytest.MonkeyPatch, tmp_path:
 def test_the_model_of_the_example_has_the_camera_of_its_command() -> None:
     model = mujoco.MjModel.from_xml_path(str(ROOT / "examples" / "workshop.xml"))
     assert render.compile_scene(model).geom_ids and model.camera("room").id >= 0
+
+
+def test_readme_holds_the_results_of_the_committed_run() -> None:
+    script = load("eval/readme_results.py")
+    text = script.README.read_text(encoding="utf-8")
+    results = json.loads(script.RESULTS.read_text(encoding="utf-8"))
+    assert text == script.with_section(text, script.results_section(results)), "run eval/readme_results.py"
+
+
+def test_each_part_is_closed_and_stands_on_the_table(tmp_path: Path) -> None:
+    script = load("eval/parts.py")
+    for name in script.PARTS:
+        mesh = trimesh.load_mesh(script.write_part(name, tmp_path))
+        assert mesh.is_watertight and mesh.body_count == 1, name
+        assert mesh.bounds[0, 2] == pytest.approx(0.0, abs=1e-4)
+        assert 60.0 < mesh.extents.max() < 140.0

@@ -34,6 +34,25 @@ def angle_difference(a: Array, b: Array) -> Array:
     return wrap_angle(a - b)
 
 
+def fold_into_band(elevation: Array, band: Array) -> Array:
+    """Moves elevations into the band of a search by reflection at the ends of the band.
+
+    Reflection keeps the density of random samples smooth. Clipping would put many samples on the ends of the band.
+
+    Args:
+      elevation: f32[...] rad, elevations inside or outside the band.
+      band: f32[2] rad, lowest and highest elevation. A band of zero width gives its one elevation.
+
+    Returns:
+      Elevations inside the band, f32[...] rad.
+    """
+    width = band[1] - band[0]
+    period = jnp.where(width > 0.0, 2.0 * width, 1.0)
+    offset = jnp.mod(elevation - band[0], period)
+    folded = band[0] + jnp.minimum(offset, period - offset)
+    return jnp.where(width > 0.0, jnp.clip(folded, band[0], band[1]), band[0])
+
+
 def view_pose(view: View, center: Array, radius: float | Array) -> SE3:
     """Returns the camera's pose in world (T_world_camera) for a view: the camera looks at `center`, image upright.
 
@@ -71,6 +90,34 @@ def rotation_error(a: Array, b: Array) -> Array:
     squared = jnp.sum((relative - jnp.swapaxes(relative, -1, -2)) ** 2, axis=(-2, -1))
     twice_sine = jnp.sqrt(jnp.maximum(squared, 1e-20) / 2.0)
     return jnp.arctan2(twice_sine, twice_cosine)
+
+
+def symmetric_turn(a: Array, b: Array, order: int) -> Array:
+    """Returns the turn about world z, one that maps a symmetric object to itself, that brings B nearest to A.
+
+    The angle maximises trace(A^T Rz B), which is a cosine of the angle plus a constant. So the best turn of a symmetric
+    object is the multiple of 2 pi / order that is nearest to the maximum.
+
+    Args:
+      a: f32[..., 3, 3], rotation matrices A.
+      b: f32[..., 3, 3], rotation matrices B.
+      order: number of turns about z that map the object to itself; 1 without symmetry, 0 for any turn.
+
+    Returns:
+      Angle of the turn, f32[...] rad.
+    """
+    product = b @ jnp.swapaxes(a, -1, -2)
+    sine, cosine = product[..., 0, 1] - product[..., 1, 0], product[..., 0, 0] + product[..., 1, 1]
+    best = jnp.arctan2(sine, cosine)
+    if order == 0:
+        return best
+    step = 2.0 * jnp.pi / order
+    return step * jnp.round(best / step)
+
+
+def turn_about_z(angle: Array) -> Array:
+    """Returns the rotation matrices f32[..., 3, 3] of turns about world z by `angle`, f32[...] rad."""
+    return SO3.from_z_radians(angle).as_matrix()
 
 
 def frobenius_angle(a: Array, b: Array) -> Array:

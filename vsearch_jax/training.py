@@ -18,7 +18,15 @@ from jax import Array
 
 from vsearch_jax import encoder as encoders
 from vsearch_jax.config import Config
-from vsearch_jax.env import ViewSearchEnv, check_band, encoder_example, obs_of, zero_observation
+from vsearch_jax.env import (
+    FALSE_POSITIVE_DEG,
+    ViewSearchEnv,
+    check_band,
+    encoder_example,
+    obs_of,
+    random_example_views,
+    zero_observation,
+)
 from vsearch_jax.search import sac
 from vsearch_jax.types import EncoderState, Observation, ReplayState, SACState, TrainState, Transition
 from vsearch_jax.xla.tree import tree_where
@@ -27,6 +35,7 @@ Metrics: TypeAlias = dict[str, Array]
 Tree = TypeVar("Tree")
 
 ENCODER_STAGE, POLICY_STAGE = 0, 1
+ENCODER_METRICS = ("encoder_loss", "false_match_rate", "threshold_angle_deg")
 _UPDATE_METRICS = ("critic_loss", "actor_loss", "alpha", "entropy")
 POLICY_METRICS = ("reward", "similarity", "success_rate", "unreachable_rate", *_UPDATE_METRICS)
 
@@ -113,7 +122,7 @@ def _train(state: TrainState, config: Config) -> tuple[TrainState, Metrics]:
     start = state.step
     stop = jnp.minimum(start + length, config.num_iterations)
     encoder_stop = jnp.clip(num_updates, start, stop)
-    metrics = {name: jnp.full((length,), jnp.nan) for name in ("encoder_loss", *POLICY_METRICS)}
+    metrics = {name: jnp.full((length,), jnp.nan) for name in (*ENCODER_METRICS, *POLICY_METRICS)}
     metrics["stage"] = jnp.full((length,), -1, jnp.int32)
 
     env = ViewSearchEnv(config, state.encoder, state.reach)
@@ -163,10 +172,15 @@ def encoder_iteration(
     Returns:
       The encoder after the update, and the metrics of the update by name, f32[] each.
     """
-    keys = jax.random.split(jax.random.fold_in(key, i), env.config.encoder.batch_size)
-    inputs, targets = jax.vmap(functools.partial(encoder_example, env=env))(keys)
-    encoder, loss = encoders.update(encoder, inputs, targets, env.config)
-    return encoder, {"encoder_loss": loss, "stage": jnp.int32(ENCODER_STAGE)}
+    view_key, example_key = jax.random.split(jax.random.fold_in(key, i))
+    views = random_example_views(view_key, env)
+    keys = jax.random.split(example_key, env.config.encoder.batch_size)
+    inputs, targets, rotations = jax.vmap(functools.partial(encoder_example, env=env))(keys, views)
+    angles = encoders.view_angles(rotations, env.scene.symmetry)
+    encoder, loss, latents = encoders.update(encoder, inputs, targets, angles, env.config)
+    # The views are new in every update, so before the update they are held out.
+    matches = encoders.match_metrics(latents, angles, env.config, FALSE_POSITIVE_DEG)
+    return encoder, {"encoder_loss": loss, "stage": jnp.int32(ENCODER_STAGE)} | matches
 
 
 def _finish_encoder(index: Array, state: TrainState, *, config: Config) -> TrainState:
@@ -179,8 +193,10 @@ def _finish_encoder(index: Array, state: TrainState, *, config: Config) -> Train
     keys = jax.random.split(jax.random.fold_in(state.key, _POOL + index), config.encoder.pool_size)
     batch_size = _CPU_POOL_BATCH_SIZE if jax.default_backend() == "cpu" else _POOL_BATCH_SIZE
     pool, raw = jax.lax.map(functools.partial(_raw_observation, env), keys, batch_size=batch_size)
-    mean, whitening = encoders.fit_whitening(raw, config.encoder.whitening_power)
-    encoder = dataclasses.replace(state.encoder, latent_mean=mean, whitening=whitening)
+    encoder = state.encoder
+    if config.encoder.loss == "autoencoder":  # The pose loss is about the cosines of the raw latents.
+        mean, whitening = encoders.fit_whitening(raw, config.encoder.whitening_power)
+        encoder = dataclasses.replace(encoder, latent_mean=mean, whitening=whitening)
     pool = dataclasses.replace(pool, code=jax.vmap(functools.partial(encoders.code_of, encoder))(raw))
     shape = (config.sac.num_seeds, config.sac.num_envs)
     start = functools.partial(_start_from_pool, env=env, pool=pool)

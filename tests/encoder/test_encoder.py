@@ -70,7 +70,7 @@ def test_both_convolutions_and_their_gradients_agree(kernel_size, stride):
 @pytest.mark.parametrize("kind", INPUTS)
 def test_code_and_reconstruction_have_the_configured_shape_for_every_preset_and_input(preset, kind):
     config = Config.preset(preset)
-    config = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, input=kind))
+    config = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, input=kind, loss="both"))
     features, size = 3 if kind == "rgb" else 1, config.scene.image_size
     state = jax.eval_shape(lambda: encoders.init(jax.random.key(0), config))
     x = jax.ShapeDtypeStruct((size, size, features), jnp.float32)
@@ -81,7 +81,7 @@ def test_code_and_reconstruction_have_the_configured_shape_for_every_preset_and_
 
 
 def test_parameters_are_nested_dictionaries_of_arrays_and_depend_on_the_key():
-    config = smoke_config()
+    config = smoke_config(loss="both")
     first, again, other = (encoders.init(jax.random.key(seed), config).params for seed in (0, 0, 1))
     assert set(first) == {"encoder", "decoder"}
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(first))
@@ -163,21 +163,27 @@ def test_whitening_bounds_small_eigenvalues_and_is_the_identity_for_a_constant_l
 # -- training -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", INPUTS)
-def test_updates_reduce_the_loss_and_change_nothing_after_num_updates(kind):
-    config = smoke_config(input=kind, num_updates=150, learning_rate=3e-3)
+@pytest.mark.parametrize(
+    ("kind", "loss"), [*((kind, "autoencoder") for kind in INPUTS), ("rgb", "pose"), ("rgb", "both")]
+)
+def test_updates_reduce_the_loss_and_change_nothing_after_num_updates(kind, loss):
+    config = smoke_config(input=kind, loss=loss, num_updates=150, learning_rate=3e-3)
     shape = (8, 32, 32, network.in_features(config.encoder))
     inputs = jax.random.uniform(jax.random.key(1), shape)
-    targets = jax.image.resize(inputs, (8, 16, 16, shape[-1]), "linear")
+    targets = None if loss == "pose" else jax.image.resize(inputs, (8, 16, 16, shape[-1]), "linear")
+    angles = 0.4 * jnp.abs(jnp.arange(8.0)[:, None] - jnp.arange(8.0)[None])
+
+    def update(state):
+        return encoders.update(state, inputs, targets, angles, config)[:2]
 
     def body(_, carry):
-        return encoders.update(carry[0], inputs, targets, config)
+        return update(carry[0])
 
     start = encoders.init(jax.random.key(0), config)
-    _, first = encoders.update(start, inputs, targets, config)
+    _, first = update(start)
     end, last = jax.jit(lambda state: jax.lax.fori_loop(0, 150, body, (state, 0.0)))(start)
     assert float(last) < 0.35 * float(first)
-    after, _ = encoders.update(end, inputs, targets, config)
+    after, _ = update(end)
     for a, b in zip(jax.tree.leaves(end.params), jax.tree.leaves(after.params), strict=True):
         np.testing.assert_array_equal(a, b)
     count = optax.tree_utils.tree_get(end.opt_state, "ScaleByAdamState").count

@@ -1,14 +1,11 @@
 """Random search against problems with a known optimum, and the record that all black-box searchers share."""
 
 import functools
-import math
 
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
 import probes
 from vsearch_jax.config import RandomSearchConfig
@@ -128,19 +125,3 @@ def test_images_after_the_first_hit_are_not_taken():
     assert float(record.view.azimuth) == 3.0
     np.testing.assert_allclose(record.best_scores, np.full(3, 0.981), atol=1e-6)
     assert not bool(common.is_running(record, jnp.asarray(0.98)))
-
-
-ANGLE = st.floats(-20.0, 20.0, width=32)
-
-
-@hypothesis.given(ANGLE, st.floats(0.0, 1.0, width=32), st.floats(0.0, 0.5, width=32))
-def test_an_elevation_is_reflected_into_the_band(elevation, low, height):
-    band = jnp.asarray([low, low + height], jnp.float32)
-    folded = common.fold_into_band(jnp.asarray(elevation, jnp.float32), band)
-    assert float(band[0]) <= float(folded) <= float(band[1])
-    np.testing.assert_allclose(common.fold_into_band(folded, band), folded, atol=1e-5)
-    if height > 0.1:
-        # Reflection keeps the cosine of the phase.
-        phase = math.pi * (elevation - low) / height
-        phase_folded = math.pi * (float(folded) - low) / height
-        assert math.cos(phase_folded) == pytest.approx(math.cos(phase), abs=2e-3)

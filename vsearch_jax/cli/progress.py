@@ -93,7 +93,14 @@ def summarize_chunk(seconds: float, lines: Sequence[MetricsLine]) -> str:
     """
     stage = lines[-1]["stage"]
     parts = [stage, f"{len(lines) / seconds:.1f} iterations/s"]
-    for name, key in {"loss": _LOSS_OF_STAGE[stage], "reward": "reward", "success": "success_rate"}.items():
+    shown = {
+        "loss": _LOSS_OF_STAGE[stage],
+        "false matches": "false_match_rate",
+        "degrees at the threshold": "threshold_angle_deg",
+        "reward": "reward",
+        "success": "success_rate",
+    }
+    for name, key in shown.items():
         values = [line[key] for line in lines if key in line]
         if values:
             parts.append(f"{name} {sum(values) / len(values):.4g}")

@@ -22,6 +22,8 @@ class SceneConfig:
     """Whether the object's mesh is moved over the origin and onto the table. If not, it keeps the file's position."""
     obstacles: str | None = None
     """Name of obstacles in xml/obstacles, or path of an MJCF file in world coordinates. None adds no obstacles."""
+    symmetry: int | None = None
+    """Number of turns about the vertical that map the object to itself. 1: none, 0: any. None: as its MJCF declares."""
     mount_height: float = 1.355
     """Height of the arm's base above the table, in m. The arm hangs from it."""
     radius: float = 0.35
@@ -36,6 +38,7 @@ class SceneConfig:
     def __post_init__(self) -> None:
         require_positive(self, "mount_height", "radius", "image_size", "mesh_scale")
         require_finite(self, "center_height", "table_clearance")
+        require(self, "symmetry", self.symmetry is None or self.symmetry >= 0, "0 or more")
         require(self, "center_height", self.center_height >= 0.0, "0 or more")
         require(self, "table_clearance", self.table_clearance >= 0.0, "0 or more")
         require(self, "image_size", self.image_size % 16 == 0, "a multiple of 16")
@@ -43,8 +46,14 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """Augmented autoencoder, which maps an image to a code."""
+    """Encoder, which maps an image to a code."""
 
+    loss: Literal["autoencoder", "pose", "both"] = "pose"
+    """Training: reconstruct the clean view (thesis), match cosines to the known angles between views, or both."""
+    threshold_angle_deg: float = 3.0
+    """Angle between two views at which the pose loss wants the threshold as cosine, in degrees."""
+    wide_weight: float = 0.3
+    """Weight of the wide part of the cosine that the pose loss wants. The wide part leads back from the far side."""
     input: Literal["rgb", "depth", "silhouette"] = "rgb"
     """Part of the image that the encoder reads."""
     code_size: int = 128
@@ -57,7 +66,7 @@ class EncoderConfig:
     """Height and width of the kernels of stride-2 convolutions, in pixels."""
     decoder_size: int = 64
     """Height and width of the decoder's image, in pixels."""
-    num_updates: int = 800
+    num_updates: int = 400
     """Number of optimizer updates."""
     batch_size: int = 64
     """Number of views rendered for each update."""
@@ -71,7 +80,10 @@ class EncoderConfig:
     """Number of reachable views in the pool. The whitening is fitted to them. Training episodes start from them."""
 
     def __post_init__(self) -> None:
+        require(self, "loss", self.loss in ("autoencoder", "pose", "both"), "autoencoder, pose or both")
         require(self, "input", self.input in ("rgb", "depth", "silhouette"), "rgb, depth or silhouette")
+        require(self, "threshold_angle_deg", 0.0 < self.threshold_angle_deg <= 30.0, "greater than 0, at most 30")
+        require(self, "wide_weight", 0.0 <= self.wide_weight <= 0.9, "from 0 to 0.9")
         require_positive(self, "code_size", "num_updates", "batch_size", "learning_rate", "decoder_size")
         require(self, "kernel_size", self.kernel_size in (3, 5), "3 or 5")
         require(self, "stem_stride", self.stem_stride in (2, 4), "2 or 4")
@@ -90,6 +102,10 @@ class EncoderConfig:
         require_unit(self, "bootstrap_fraction")
         require(self, "bootstrap_fraction", self.bootstrap_fraction > 0.0, "greater than 0, at most 1")
         require(self, "whitening_power", 0.0 <= self.whitening_power <= 0.5, "from 0 to 0.5")
+        is_free = self.loss == "autoencoder" or self.whitening_power == 0.0
+        require(
+            self, "whitening_power", is_free, "0, because whitening would change the cosines that the pose loss wants"
+        )
         require(self, "pool_size", self.pool_size >= 2, "2 or more")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -33,6 +34,13 @@ class Config:
         reduction = self.encoder.stem_stride * 2 ** (len(self.encoder.channels) - 1)
         allowed = f"a multiple of {reduction} (the encoder's convolutions divide the size by it)"
         require(self.scene, "image_size", self.scene.image_size % reduction == 0, allowed)
+        if self.encoder.loss != "autoencoder":
+            angle, wide = self.encoder.threshold_angle_deg, self.encoder.wide_weight
+            low = wide * math.cos(math.radians(angle))
+            high = low + 1.0 - wide
+            allowed = f"between {low:.4f} and {high:.4f}, with EncoderConfig.threshold_angle_deg {angle:g} and "
+            allowed += f"EncoderConfig.wide_weight {wide:g}"
+            require(self.env, "threshold", low < self.env.threshold < high, allowed)
         require(
             self,
             "num_chunks",
@@ -95,9 +103,10 @@ PRESETS: dict[str, Config] = {
         evaluation=EvaluationConfig(num_initial_views=4, num_runs=1, num_episodes=8, batch_size=8),
         num_chunks=4,
     ),
-    "cpu": Config(sac=SACConfig(num_seeds=3), num_chunks=36),
+    "cpu": Config(sac=SACConfig(num_seeds=3), num_chunks=26),
     "thesis": Config(
         encoder=EncoderConfig(
+            loss="autoencoder",
             channels=(128, 256, 256, 512),
             stem_stride=2,
             kernel_size=5,
@@ -106,13 +115,14 @@ PRESETS: dict[str, Config] = {
             learning_rate=2e-4,
             pool_size=4096,
         ),
+        random_search=RandomSearchConfig(num_wide=0),
         sac=SACConfig(num_seeds=3, num_environment_steps=10_880),
         num_chunks=767,
     ),
     "gpu": Config(
-        encoder=EncoderConfig(num_updates=12_000, batch_size=256, decoder_size=128, pool_size=4096),
+        encoder=EncoderConfig(num_updates=6_000, batch_size=256, pool_size=4096),
         sac=SACConfig(num_seeds=10, num_environment_steps=10_240),
         evaluation=EvaluationConfig(batch_size=500),
-        num_chunks=79,
+        num_chunks=83,
     ),
 }

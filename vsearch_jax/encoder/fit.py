@@ -1,4 +1,4 @@
-"""Training of the autoencoder: bootstrapped L2 loss with Adam, then mean and partial whitening of the latent."""
+"""Training of the encoder with Adam: loss of the decoder, pose loss; then mean and partial whitening of the latent."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jax import Array
 
 from vsearch_jax.config import Config
 from vsearch_jax.encoder import network
+from vsearch_jax.encoder.pose_loss import pose_loss
 from vsearch_jax.types import EncoderState, ParamTree
 
 _NUM_BISECTIONS = 16
@@ -21,7 +22,9 @@ _EIGENVALUE_FLOOR = 1e-2
 
 
 def init(key: Array, config: Config) -> EncoderState:
-    """Returns an untrained autoencoder with random parameters. Latent mean is zero, and whitening is the identity.
+    """Returns an untrained encoder with random parameters, and a decoder if the loss needs one.
+
+    Latent mean is zero, and whitening is the identity.
 
     Args:
       key: PRNG key of the parameters.
@@ -61,46 +64,54 @@ def bootstrapped_mean(errors: Array, fraction: float) -> Array:
     return threshold + jnp.mean(jnp.maximum(errors - threshold, 0.0)) / fraction
 
 
-def reconstruction_loss(params: ParamTree, x: Array, target: Array, config: Config) -> Array:
+def reconstruction_loss(params: ParamTree, latent: Array, target: Array, config: Config) -> Array:
     """Computes the autoencoder's loss on one view: the mean of the largest squared errors of the decoded image.
 
     Args:
       params: parameters of encoder and decoder.
-      x: f32[H, W, C], augmented input image with C channels.
+      latent: f32[Z], raw latent of the augmented view.
       target: f32[h, w, C], clean image that the decoder must reproduce; h and w are `decoder_size`.
       config: the run's config.
 
     Returns:
       Loss, f32[].
     """
-    latent = network.raw_latent(params, x, config)
     errors = jnp.mean((network.reconstruct(params, latent, config) - target) ** 2, axis=-1)
     return bootstrapped_mean(errors.reshape(-1), config.encoder.bootstrap_fraction)
 
 
-def update(encoder: EncoderState, inputs: Array, targets: Array, config: Config) -> tuple[EncoderState, Array]:
-    """Trains encoder and decoder by one step of Adam on a batch of B views.
+def update(
+    encoder: EncoderState, inputs: Array, targets: Array | None, angles: Array, config: Config
+) -> tuple[EncoderState, Array, Array]:
+    """Trains encoder, and decoder if there is one, by one step of Adam on a batch of B views.
 
     Args:
       encoder: state before the step. Latent mean and whitening do not change.
       inputs: f32[B, H, W, C], augmented input images with C channels.
-      targets: f32[B, h, w, C], clean images of the same views; h and w are `decoder_size`.
-      config: the run's config.
+      targets: f32[B, h, w, C], clean images of the same views; h and w are `decoder_size`. None for the pose loss.
+      angles: f32[B, B] rad, angles between the views.
+      config: the run's config; `encoder.loss` chooses the loss.
 
     Returns:
-      The state after the step, and the mean loss f32[] of the batch before the step.
+      The state after the step; the loss f32[] of the batch before the step; the raw latents f32[B, Z] before the step.
     """
 
-    def batch_loss(params: ParamTree) -> Array:
-        losses = jax.vmap(reconstruction_loss, in_axes=(None, 0, 0, None))(params, inputs, targets, config)
-        return jnp.mean(losses)
+    def batch_loss(params: ParamTree) -> tuple[Array, Array]:
+        latents = jax.vmap(network.raw_latent, in_axes=(None, 0, None))(params, inputs, config)
+        loss = jnp.zeros(())
+        if targets is not None:
+            rebuild = jax.vmap(reconstruction_loss, in_axes=(None, 0, 0, None))
+            loss += jnp.mean(rebuild(params, latents, targets, config))
+        if config.encoder.loss != "autoencoder":
+            loss += pose_loss(latents, angles, config)
+        return loss, latents
 
-    loss, gradients = jax.value_and_grad(batch_loss)(encoder.params)
+    (loss, latents), gradients = jax.value_and_grad(batch_loss, has_aux=True)(encoder.params)
     with jax.numpy_dtype_promotion("standard"):  # optax raises a float to the power of its integer step count
         updates, opt_state = optimizer(config).update(gradients, encoder.opt_state)
     # optax keeps the structure of the parameters, but its type is any tree.
     params = cast(ParamTree, optax.apply_updates(encoder.params, updates))
-    return dataclasses.replace(encoder, params=params, opt_state=opt_state), loss
+    return dataclasses.replace(encoder, params=params, opt_state=opt_state), loss, latents
 
 
 def fit_whitening(raw: Array, power: float) -> tuple[Array, Array]:

@@ -185,17 +185,17 @@ def _graphs(config: Config) -> tuple[nnx.GraphDef[Encoder], nnx.GraphDef[Decoder
 
 
 def init_params(key: Array, config: Config) -> ParamTree:
-    """Returns random parameters of the autoencoder as a dictionary with the keys `encoder` and `decoder`.
+    """Returns random parameters as a dictionary with the keys `encoder` and `decoder`. The pose loss has no decoder.
 
     Args:
       key: PRNG key of the parameters.
       config: the run's config; its encoder part and the image size are used.
     """
     encoder, decoder = build(key, config)
-    return {
-        "encoder": nnx.to_pure_dict(nnx.state(encoder)),
-        "decoder": nnx.to_pure_dict(nnx.state(decoder)),
-    }
+    params: ParamTree = {"encoder": nnx.to_pure_dict(nnx.state(encoder))}
+    if config.encoder.loss != "pose":
+        params["decoder"] = nnx.to_pure_dict(nnx.state(decoder))
+    return params
 
 
 def raw_latent(params: ParamTree, x: Array, config: Config) -> Array:

@@ -1,6 +1,7 @@
 """The view-search task (thesis 4.3) as a `brax.envs.Env`."""
 
 from vsearch_jax.env.episode import (
+    FALSE_POSITIVE_DEG,
     UnreachableError,
     build_obs,
     check_band,
@@ -10,10 +11,12 @@ from vsearch_jax.env.episode import (
     step_reward,
     zero_observation,
 )
-from vsearch_jax.env.examples import encoder_example
+from vsearch_jax.env.examples import EncoderExample, encoder_example, random_example_views
 from vsearch_jax.env.task import ViewSearchEnv
 
 __all__ = [
+    "FALSE_POSITIVE_DEG",
+    "EncoderExample",
     "UnreachableError",
     "ViewSearchEnv",
     "build_obs",
@@ -22,6 +25,7 @@ __all__ = [
     "episode_of",
     "obs_of",
     "pose_error",
+    "random_example_views",
     "step_reward",
     "zero_observation",
 ]

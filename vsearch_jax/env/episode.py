@@ -14,10 +14,20 @@ from jax import Array
 from jax.core import Tracer
 
 from vsearch_jax.config import Config, ConfigError, EnvConfig
-from vsearch_jax.geometry import cosine_similarity, frobenius_angle, rotation_error, wrap_angle
+from vsearch_jax.geometry import (
+    cosine_similarity,
+    frobenius_angle,
+    rotation_error,
+    symmetric_turn,
+    turn_about_z,
+    wrap_angle,
+)
 from vsearch_jax.planning import Motion
 from vsearch_jax.types import Camera, EpisodeState, Observation, ReachabilityMap, View
 from vsearch_jax.xla.tree import tree_where
+
+FALSE_POSITIVE_DEG = 10.0
+"""A found view is a false positive if its rotation error is larger than this (thesis 3.6)."""
 
 
 class UnreachableError(ConfigError):
@@ -168,20 +178,30 @@ def commanded_view(view: View, action: Array, action_scale_deg: float) -> View:
     return View(wrap_angle(view.azimuth + delta[0]), view.elevation + delta[1])
 
 
-def pose_error(camera: Camera, target: Camera) -> tuple[Array, Array, Array]:
+def pose_error(camera: Camera, target: Camera, symmetry: int = 1, center: Array | None = None) -> tuple[Array, ...]:
     """Computes the rotation and translation errors of a camera pose with respect to a target camera pose.
+
+    The object may be symmetric. Then the errors are those to the nearest pose from which the object looks the same as
+    from the target (the convention of the BOP benchmark).
 
     Args:
       camera: the camera in world; its arrays may have leading batch axes.
       target: the camera in world at the target view.
+      symmetry: number of turns about the vertical that map the object to itself; 1 for none, 0 for any turn.
+      center: f32[3] m in world, a point on the axis of these turns; needed unless `symmetry` is 1.
 
     Returns:
       Three f32 arrays with the batch axes: the geodesic rotation error in rad, the rotation error in rad by formula 3.2
       of the thesis, and the translation error in m.
     """
-    translation = jnp.sqrt(jnp.sum((camera.position - target.position) ** 2, axis=-1))
-    rotations = (camera.rotation, target.rotation)
-    return rotation_error(*rotations), frobenius_angle(*rotations), translation
+    rotation, position = target.rotation, target.position
+    if symmetry != 1:
+        assert center is not None
+        turn = turn_about_z(symmetric_turn(camera.rotation, rotation, symmetry))
+        rotation = turn @ rotation
+        position = center + jnp.einsum("...ij,...j->...i", turn, position - center)
+    translation = jnp.sqrt(jnp.sum((camera.position - position) ** 2, axis=-1))
+    return rotation_error(camera.rotation, rotation), frobenius_angle(camera.rotation, rotation), translation
 
 
 def _as_pipeline_state(episode: EpisodeState) -> base.State:

@@ -102,7 +102,7 @@ def run_episode(
     end = result.end
     assert end is not None  # the policy's search always sets it; only the black-box searchers leave it out
     last = episode_of(end.state)
-    return measure_outcome(env.config, result, last.observation.camera, last.target.camera) | {
+    return measure_outcome(env, result, last.observation.camera, last.target.camera) | {
         "num_helped": num_helped,
         "joint_travel": end.travel,
         "motion_time": end.duration,

@@ -7,22 +7,18 @@ from typing import TypeAlias
 
 from jax import Array
 
-from vsearch_jax.config import Config
-from vsearch_jax.env import pose_error
+from vsearch_jax.env import FALSE_POSITIVE_DEG, ViewSearchEnv, pose_error
 from vsearch_jax.types import Camera, SearchResult, View
-
-FALSE_POSITIVE_DEG = 10.0
-"""A found view is a false positive if its rotation error is larger than this (thesis 3.6)."""
 
 Outcome: TypeAlias = dict[str, Array | View]
 """Measures of one or more finished searches, by name."""
 
 
-def measure_outcome(config: Config, result: SearchResult, camera: Camera, target: Camera) -> Outcome:
+def measure_outcome(env: ViewSearchEnv, result: SearchResult, camera: Camera, target: Camera) -> Outcome:
     """Measures one finished search: success, number of images, pose errors with respect to the target camera.
 
     Args:
-      config: the run's config; `env.threshold` is read.
+      env: the task. Its threshold and the object's symmetry are read.
       result: the searcher's result.
       camera: camera in world at the end of the search.
       target: camera in world at the target view.
@@ -32,8 +28,8 @@ def measure_outcome(config: Config, result: SearchResult, camera: Camera, target
       `rotation_error` f32[] rad, `frobenius_angle` f32[] rad, `translation_error` f32[] m, `is_false_positive` bool[],
       `unreachable` i32[], and `best_scores` f32[G], G = the largest number of generations that the config allows.
     """
-    rotation, frobenius, translation = pose_error(camera, target)
-    is_success = result.score >= config.env.threshold
+    rotation, frobenius, translation = pose_error(camera, target, env.scene.symmetry, env.center)
+    is_success = result.score >= env.config.env.threshold
     return {
         "is_success": is_success,
         "evaluations": result.evaluations,

@@ -106,7 +106,7 @@ def _evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
     measure_trials = jax.vmap(measure_outcome, in_axes=(None, 0, 0, None))
     outcomes: dict[str, Outcome] = {}
     for name, (result, motions, counts, camera) in zip(BLACK_BOX, trials, strict=True):
-        measured: Outcome = measure_trials(config, result, camera, target.camera)
+        measured: Outcome = measure_trials(env, result, camera, target.camera)
         outcomes[name] = measured | motions | counts | {"initial_view": initial.view, "target_view": target_views}
     return outcomes | evaluate_policies(env, state, (search_keys, ends), grid)
 

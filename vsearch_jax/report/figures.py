@@ -20,6 +20,19 @@ from vsearch_jax.types import ReachabilityMap
 THESIS_BAND_DEG = (40, 70)
 """Elevations in degrees that the thesis's arm reached at every azimuth."""
 
+_ENCODER_PANELS = {
+    "encoder_loss": "encoder loss",
+    "false_match_rate": "share of matches > 10° off",
+    "threshold_angle_deg": "angle of matches, median (°)",
+}
+_POLICY_PANELS = {
+    "reward": "reward of a step",
+    "success_rate": "success rate of ended episodes",
+    "critic_loss": "critic loss",
+    "actor_loss": "actor loss",
+    "alpha": "temperature α",
+}
+
 
 @styled
 def draw_reachability(reach: ReachabilityMap, wanted_deg: tuple[float, float] | None = None) -> Figure:
@@ -87,13 +100,13 @@ def draw_training(lines: Sequence[Mapping[str, float | str]], config: Config) ->
       lines: lines of metrics.jsonl, one for each iteration.
       config: the run's config.
     """
-    figure = Figure(figsize=(10, 5.6))
-    panels = figure.subplots(2, 3)
-    policy = [("reward", "reward of a step"), ("success_rate", "success rate of ended episodes")]
-    policy += [("critic_loss", "critic loss"), ("actor_loss", "actor loss"), ("alpha", "temperature α")]
-    _plot_metric(panels.flat[0], lines, "encoder_loss", config, COLORS["cma_es"])
-    panels.flat[0].set(xlabel="encoder updates", ylabel="bootstrapped L2 loss", yscale="log")
-    for axes, (name, label) in zip(panels.flat[1:], policy, strict=True):
+    figure = Figure(figsize=(13, 5.6))
+    panels = figure.subplots(2, 4)
+    for axes, (name, label) in zip(panels.flat[:3], _ENCODER_PANELS.items(), strict=True):
+        _plot_metric(axes, lines, name, config, COLORS["cma_es"])
+        axes.set(xlabel="encoder updates", ylabel=label)
+    panels.flat[0].set(yscale="log")
+    for axes, (name, label) in zip(panels.flat[3:], _POLICY_PANELS.items(), strict=True):
         _plot_metric(axes, lines, name, config, COLORS["sac"])
         axes.set(xlabel="environment steps of a policy", ylabel=label)
     figure.suptitle("Training: values of each iteration, and their running mean", x=0.01, ha="left")
@@ -106,7 +119,7 @@ def _plot_metric(axes: Axes, lines: Sequence[Mapping[str, float | str]], name: s
     if not points:
         return
     iterations, values = np.array(points).T
-    if name != "encoder_loss":
+    if name not in _ENCODER_PANELS:
         iterations = (iterations - config.encoder.num_updates + 1) * config.sac.num_envs
     width = max(1, len(values) // 40)
     axes.plot(iterations, values, color=color, alpha=0.25, linewidth=0.8)

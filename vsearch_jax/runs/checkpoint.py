@@ -25,7 +25,7 @@ import tensorstore
 
 from vsearch_jax.config import Config
 from vsearch_jax.runs.folder import CHECKPOINTS, resume_command
-from vsearch_jax.runs.old_versions import UNVERSIONED, current_names
+from vsearch_jax.runs.old_versions import UNVERSIONED, current_names, with_later_fields
 
 NUM_KEPT = 2
 """Number of checkpoints kept in a run's folder: the last one and the one before."""
@@ -130,7 +130,7 @@ def restore(run: Path, template: State, config: Config) -> State:
     folder = run / CHECKPOINTS / str(step)
     about = cast(_About, _read(run, step, "about", ocp.args.JsonRestore()))  # JSON has no static type
     version = about.get("version", UNVERSIONED)
-    _check_config(folder, about["config"], config, version)
+    _check_config(folder, with_later_fields(about["config"]), config, version)
     described = {name: (shape, dtype) for name, (shape, dtype) in about["arrays"].items()}
     names = current_names(described, version)
     leaves = {name: jax.eval_shape(_data, leaf) for name, leaf in _named_leaves(template).items()}

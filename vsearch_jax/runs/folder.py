@@ -16,6 +16,7 @@ from pathlib import Path
 
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.runs.atomic import write_atomically
+from vsearch_jax.runs.old_versions import with_later_fields
 
 try:
     import fcntl
@@ -165,7 +166,7 @@ def read_config(run: Path) -> Config:
     """
     values = {name: value for name, value in _read_json(run).items() if name != "seed"}
     try:
-        return Config.from_dict(values)
+        return Config.from_dict(with_later_fields(values))
     except (ValueError, TypeError, AttributeError) as error:  # a value is out of range or has a wrong type
         raise ConfigFileError(f"{run / CONFIG}: {error}; {_REMEDY}") from error
 

@@ -1,4 +1,4 @@
-"""Names of the arrays in checkpoints of earlier versions.
+"""Runs of earlier versions: names of the arrays in their checkpoints, and fields that their configs do not have.
 
 A checkpoint stores each array under its path in the pytree. Where a version renamed a field, the table here maps the
 old name to the new one.
@@ -6,7 +6,7 @@ old name to the new one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 UNVERSIONED = "0.1.0"
 """The version whose checkpoints store no version."""
@@ -22,6 +22,27 @@ _RENAMES = {
 
 _DROPPED = {UNVERSIONED: ("replay.data.truncated",)}
 """For each version: arrays that no later version reads."""
+
+_LATER_FIELDS: dict[str, dict[str, object]] = {
+    "scene": {"symmetry": None},
+    "encoder": {"loss": "autoencoder", "threshold_angle_deg": 3.0, "wide_weight": 0.3},
+    "random_search": {"num_wide": 0},
+}
+"""Fields of the config that came after version 0.2.0, with the values that mean what earlier versions did."""
+
+
+def with_later_fields(config: Mapping[str, object]) -> dict[str, object]:
+    """Returns a stored config with the fields that its version did not have yet.
+
+    Args:
+      config: nested plain values, as `Config.to_dict` of any version gives them.
+    """
+    full = dict(config)
+    for section, fields in _LATER_FIELDS.items():
+        present = full.get(section, {})
+        if isinstance(present, dict):
+            full[section] = fields | present
+    return full
 
 
 def current_names(stored: Iterable[str], version: str) -> dict[str, str]:

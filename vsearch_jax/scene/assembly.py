@@ -20,6 +20,7 @@ from vsearch_jax.scene.files import (
     load_object,
     load_static,
     one_line,
+    symmetry_of,
     xml_folder,
 )
 from vsearch_jax.scene.joint_chain import joints_above
@@ -51,6 +52,7 @@ class Scene:
       object_geom_ids: geoms of the object.
       obstacle_geom_ids: geoms of the obstacles.
       table_geom_id: the plane of the table.
+      symmetry: number of turns about the vertical that map the object to itself; 1 for none, 0 for any turn.
     """
 
     mj_model: mujoco.MjModel
@@ -68,6 +70,7 @@ class Scene:
     object_geom_ids: tuple[int, ...]
     obstacle_geom_ids: tuple[int, ...]
     table_geom_id: int
+    symmetry: int
 
 
 def build_scene(config: SceneConfig) -> Scene:
@@ -88,11 +91,13 @@ def build_scene(config: SceneConfig) -> Scene:
         - The arm has no site `tcp`, no camera `wrist`, or no joint that moves the camera.
         - The arm has a ball joint, or a free joint that moves the camera. (Free joints of loose parts are removed.)
         - The camera is orthographic, or its sensor is not square and centred.
-        - The object has no geom, or it is a mesh that is too large or too small.
+        - The object has no geom, or it is a mesh that is too large or too small, or its symmetry is no whole number.
         - A geom that the arm could touch is a plane.
     """
     arm_path, object_path = find_file("arm", config.arm), find_file("object", config.object)
-    model = _compile_model(config, arm_path, object_path)
+    target = load_object(object_path, config)
+    symmetry = symmetry_of(target, object_path) if config.symmetry is None else config.symmetry
+    model = _compile_model(config, arm_path, object_path, target)
     _check_planes(model)
     camera_id = model.camera(ARM_PREFIX + WRIST_CAMERA).id
     _check_camera(model, camera_id, arm_path)
@@ -114,12 +119,13 @@ def build_scene(config: SceneConfig) -> Scene:
         object_geom_ids=_geoms_below(model, model.body("object").id),
         obstacle_geom_ids=_geoms_below(model, model.body("obstacles").id),
         table_geom_id=model.geom("table").id,
+        symmetry=symmetry,
     )
 
 
-def _compile_model(config: SceneConfig, arm_path: Path, object_path: Path) -> mujoco.MjModel:
-    """Loads all parts, attaches them to the bodies of `scene.xml`, and compiles the model."""
-    arm, target = load_arm(arm_path), load_object(object_path, config)
+def _compile_model(config: SceneConfig, arm_path: Path, object_path: Path, target: mujoco.MjSpec) -> mujoco.MjModel:
+    """Loads arm and obstacles, attaches all parts to the bodies of `scene.xml`, and compiles the model."""
+    arm = load_arm(arm_path)
     spec = mujoco.MjSpec.from_file(str(xml_folder() / "scene.xml"))
     mount = spec.body("mount")
     mount.pos = [0.0, 0.0, config.mount_height]

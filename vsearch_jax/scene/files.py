@@ -147,6 +147,32 @@ def load_object(path: Path, config: SceneConfig) -> mujoco.MjSpec:
     return spec
 
 
+def symmetry_of(spec: mujoco.MjSpec, path: Path) -> int:
+    """Returns the symmetry that an object's MJCF declares: `<custom><numeric name="symmetry" data="4"/></custom>`.
+
+    It is the number of turns about the vertical through the centre of the view sphere that map the object to itself.
+
+    Args:
+      spec: the object.
+      path: the object's file, for the error message.
+
+    Returns:
+      1 if nothing is declared; 0 for any turn, as for a bowl.
+
+    Raises:
+      SceneError: the number is negative or not whole.
+    """
+    values = [numeric.data for numeric in spec.numerics if numeric.name == "symmetry"]
+    if not values:
+        return 1
+    if len(values[0]) != 1 or values[0][0] < 0 or values[0][0] != int(values[0][0]):
+        raise SceneError(
+            f"object file {str(path)!r}: numeric 'symmetry' is {list(values[0])}; give one whole number: 1 for no "
+            "symmetry, n for n equal turns about the vertical, 0 for any turn"
+        )
+    return int(values[0][0])
+
+
 def load_static(part: str, path: Path) -> mujoco.MjSpec:
     """Loads an object or obstacles from an MJCF file and removes all joints, so that nothing in it moves.
 

@@ -195,7 +195,12 @@ def evosax_promotion() -> Iterator[None]:
 
 
 def init_strategy(algorithm: Algorithm, mean: Array) -> Strategy:
-    """Returns a fresh strategy: mean `mean` (f32[2], in units of the search space) and the initial sigma."""
+    """Returns a fresh strategy with the initial sigma and no memory.
+
+    Args:
+      algorithm: from `build_algorithm`.
+      mean: f32[2], mean of the samples, in units of the search space.
+    """
     with evosax_promotion():
         # evosax requires a key here, but draws nothing from it.
         strategy = algorithm.cma_es.init(jax.random.key(0), mean, algorithm.params)

@@ -208,22 +208,3 @@ def to_result(record: Record) -> SearchResult:
         evaluations=record.evaluations,
         unreachable=record.unreachable,
     )
-
-
-def fold_into_band(elevation: Array, band: Array) -> Array:
-    """Moves elevations into the band of a search by reflection at the ends of the band.
-
-    Reflection keeps the density of random samples smooth. Clipping would put many samples on the ends of the band.
-
-    Args:
-      elevation: f32[...] rad, elevations inside or outside the band.
-      band: f32[2] rad, lowest and highest elevation. A band of zero width gives its one elevation.
-
-    Returns:
-      Elevations inside the band, f32[...] rad.
-    """
-    width = band[1] - band[0]
-    period = jnp.where(width > 0.0, 2.0 * width, 1.0)
-    offset = jnp.mod(elevation - band[0], period)
-    folded = band[0] + jnp.minimum(offset, period - offset)
-    return jnp.where(width > 0.0, jnp.clip(folded, band[0], band[1]), band[0])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.config import RandomSearchConfig
-from vsearch_jax.geometry import wrap_angle
+from vsearch_jax.geometry import fold_into_band, wrap_angle
 from vsearch_jax.search.common import (
     Method,
     Record,
@@ -18,7 +18,6 @@ from vsearch_jax.search.common import (
     SearchArgs,
     Task,
     add_generation,
-    fold_into_band,
     run_search,
     start_record,
 )
@@ -86,7 +85,7 @@ def _sample_views(
     azimuth = wrap_angle(record.view.azimuth + sigma * noise[0])
     elevation = fold_into_band(record.view.elevation + sigma * noise[1], args.band)
     uniform = jax.random.uniform(wide_key, (2, config.num_samples))
-    low, high = args.band
+    low, high = args.band[0], args.band[1]
     is_wide = jnp.arange(config.num_samples) >= config.num_samples - config.num_wide
     views = View(
         azimuth=jnp.where(is_wide, jnp.pi * (2.0 * uniform[0] - 1.0), azimuth),

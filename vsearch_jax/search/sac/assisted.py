@@ -12,8 +12,8 @@ from brax.envs.base import State
 from jax import Array
 
 from vsearch_jax.config import Config
-from vsearch_jax.geometry import wrap_angle
-from vsearch_jax.search.common import Record, SearchArgs, fold_into_band
+from vsearch_jax.geometry import fold_into_band, wrap_angle
+from vsearch_jax.search.common import Record, SearchArgs
 from vsearch_jax.search.sac.policy import PolicyTask, Progress, StepFn, mean_action, present_view, run_episode
 from vsearch_jax.types import SearchResult, View
 from vsearch_jax.xla.tree import tree_where
