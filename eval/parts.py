@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import trimesh
 from manifold3d import CrossSection, Manifold
 
@@ -32,7 +33,12 @@ def make_plate() -> Manifold:
 def make_bracket() -> Manifold:
     """Returns an L-shaped bracket of 90 x 60 x 70 mm with a rib and three holes."""
     base, wall = _box((90, 60, 10)), _box((90, 10, 70)).translate((0, 25, 0))
-    rib = CrossSection([[(0, 0), (40, 0), (0, 45)]]).extrude(10).rotate((90, 0, -90)).translate((5, 20, 10))
+    rib = (
+        CrossSection([np.array([(0, 0), (40, 0), (0, 45)], np.float64)])
+        .extrude(10)
+        .rotate((90, 0, -90))
+        .translate((5, 20, 10))
+    )
     bore = Manifold.cylinder(30, 14, 14, _SEGMENTS).rotate((90, 0, 0)).translate((-24, 40, 45))
     return base + wall + rib - bore - _hole(5, 20, (-30, -15, -1)) - _hole(5, 20, (30, -15, -1))
 

@@ -17,6 +17,7 @@ import numpy as np
 import vsearch_jax as vs
 from vsearch_jax import report, runs
 from vsearch_jax.evaluation import record_search
+from vsearch_jax.search import LABELS
 
 
 def train(folder: Path, config: vs.Config, seed: int) -> None:
@@ -61,8 +62,9 @@ def train(folder: Path, config: vs.Config, seed: int) -> None:
         seed=seed,
     )
     results = report.write_report(folder, evaluated, config)
-    for name in report.SEARCHERS:
-        print(f"{name}: success {results[name]['success_rate']:.3f}, {results[name]['evaluations_mean']:.1f} images")
+    for name in LABELS:
+        ours = results[name]
+        print(f"{name}: pose success {ours['pose_success_rate']:.3f}, {ours['evaluations_mean']:.1f} images")
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ class TrainingProgress:
         text = summarize_chunk(seconds, lines)
         self.bar.update(self._task, completed=step, description=text)
         if not self.console.is_terminal:
-            self.console.print(f"{step}/{self.config.num_iterations} {text}", highlight=False)
+            self.console.print(f"{step}/{self.config.num_iterations} {text}", highlight=False, soft_wrap=True)
 
     def announce_stop(self) -> None:
         """Shows that the training stops after the chunk of iterations that is running."""
@@ -96,7 +96,7 @@ def summarize_chunk(seconds: float, lines: Sequence[MetricsLine]) -> str:
     shown = {
         "loss": _LOSS_OF_STAGE[stage],
         "false matches": "false_match_rate",
-        "degrees at the threshold": "threshold_angle_deg",
+        "match angle (°)": "threshold_angle_deg",
         "reward": "reward",
         "success": "success_rate",
     }
