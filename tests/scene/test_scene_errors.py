@@ -80,3 +80,28 @@ def test_a_faulty_mesh_and_an_unknown_name_raise_an_error(tmp_path):
         build_scene(SceneConfig(object="teepot"))
     with pytest.raises(SceneError, match=r"SceneConfig\.arm is 'kuka'; available: lwr, ur5e"):
         build_scene(SceneConfig(arm="kuka"))
+
+
+OBJECT_WITH_SYMMETRY = """<mujoco><custom><numeric name="symmetry" data="{data}"/></custom>
+<worldbody><body><geom size="0.03"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("data", "configured", "expected"), [("4", None, 4), ("0", None, 0), ("4", 2, 2)])
+def test_the_symmetry_of_an_object_is_read_from_its_file_unless_the_config_gives_it(
+    tmp_path, data, configured, expected
+):
+    path = tmp_path / "part.xml"
+    path.write_text(OBJECT_WITH_SYMMETRY.format(data=data))
+    assert build_scene(SceneConfig(object=str(path), symmetry=configured)).symmetry == expected
+
+
+def test_an_object_without_a_declaration_has_no_symmetry():
+    assert build_scene(SceneConfig()).symmetry == 1
+
+
+@pytest.mark.parametrize("data", ["-1", "2.5", "2 3"])
+def test_a_symmetry_that_is_no_whole_number_raises_an_error(tmp_path, data):
+    path = tmp_path / "part.xml"
+    path.write_text(OBJECT_WITH_SYMMETRY.format(data=data))
+    with pytest.raises(SceneError, match=r"part\.xml.*numeric 'symmetry' is .*; give one whole number"):
+        build_scene(SceneConfig(object=str(path)))
