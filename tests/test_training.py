@@ -76,12 +76,12 @@ def test_metrics_are_finite_in_their_stage_and_nan_in_the_other(chunked):
     np.testing.assert_array_equal(np.isfinite(metrics["critic_loss"][stage == 1]), is_learning)
 
 
-def test_encoder_learns_and_does_not_change_in_the_policy_stage(chunked):
-    losses = chunked[1]["encoder_loss"][: CONFIG.encoder.num_updates]
-    assert losses[-1] < losses[0]
+def test_encoder_changes_in_its_stage_and_stays_in_the_policy_stage():
     start = vs.init(jax.random.key(0), CONFIG)
+    untrained = {path: leaf.copy() for path, leaf in arrays(start.encoder).items()}
     config, num_policy_chunks = dataclasses.replace(CONFIG, num_chunks=4), 0
     state, _ = vs.train(start, config)
+    assert any((leaf != untrained[path]).any() for path, leaf in arrays(state.encoder).items() if "params" in path)
     for _ in range(3):
         before = arrays(state.encoder)
         state, metrics = vs.train(state, config)
@@ -134,7 +134,9 @@ def test_the_arrays_of_version_0_1_0_are_those_of_this_version():
     stored = json.loads(ARRAYS_OF_0_1_0.read_text())
     names = current_names(stored, "0.1.0")
     assert len(set(names.values())) == len(names)
-    state = jax.eval_shape(lambda key: vs.init(key, SMOKE), jax.random.key(0))
+    # What version 0.1.0 trained was the autoencoder.
+    config = dataclasses.replace(SMOKE, encoder=dataclasses.replace(SMOKE.encoder, loss="autoencoder"))
+    state = jax.eval_shape(lambda key: vs.init(key, config), jax.random.key(0))
     assert {current: stored[old] for old, current in names.items()} == {
         jax.tree_util.keystr(path, simple=True, separator="."): describe(leaf)
         for path, leaf in jax.tree_util.tree_leaves_with_path(state)

@@ -61,7 +61,7 @@ def test_a_run_writes_every_file_of_its_folder(fast: None, capsys: pytest.Captur
     assert len(results["sac"]["seeds"]) == 2
     assert set(results["wall_seconds"]) == {*STAGES, "evaluation"}
     printed = capsys.readouterr().out
-    assert "Soft actor-critic" in printed and f"{config.num_iterations}/{config.num_iterations} policy" in printed
+    assert "SAC policy alone" in printed and f"{config.num_iterations}/{config.num_iterations} policy" in printed
 
 
 def test_a_folder_with_files_is_not_used(fast: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

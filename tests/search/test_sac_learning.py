@@ -22,7 +22,7 @@ BANDIT = SACConfig(
 SPHERE = SACConfig(
     hidden_sizes=(64, 64),
     batch_size=64,
-    num_environment_steps=4096,
+    num_environment_steps=6144,
     num_warmup_steps=512,
     updates_per_step=2.0,
     learning_rate=2e-3,
@@ -134,7 +134,7 @@ def test_the_policy_finds_any_target_in_few_more_steps_than_the_lower_bound(acto
     env = probes.SphereEnv(ENV)
     starts, result = run_episodes(env, actor, jax.random.split(jax.random.key(7), 500))
     end, is_found = result.end.state, np.asarray(result.score) >= ENV.threshold
-    assert is_found.mean() >= 0.93
+    assert is_found.mean() >= 0.93  # the policy alone; no local search helps
     first = episode_of(starts)
     bound = jax.vmap(env.steps_lower_bound)(first.observation.view, first.target.view)
     steps = np.asarray(result.evaluations)
