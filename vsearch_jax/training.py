@@ -178,6 +178,8 @@ def encoder_iteration(
     inputs, targets, rotations = jax.vmap(functools.partial(encoder_example, env=env))(keys, views)
     angles = encoders.view_angles(rotations, env.scene.symmetry)
     encoder, loss, latents = encoders.update(encoder, inputs, targets, angles, env.config)
+    if env.config.encoder.loss == "autoencoder":  # its codes are latents without their mean
+        latents = latents - jnp.mean(latents, axis=0, keepdims=True)
     # The views are new in every update, so before the update they are held out.
     matches = encoders.match_metrics(latents, angles, env.config, FALSE_POSITIVE_DEG)
     return encoder, {"encoder_loss": loss, "stage": jnp.int32(ENCODER_STAGE)} | matches

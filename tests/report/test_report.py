@@ -19,7 +19,7 @@ from vsearch_jax.config import Config
 from vsearch_jax.report.page import CAPTIONS
 from vsearch_jax.report.table import table_rows
 from vsearch_jax.runs.loop import Evaluated
-from vsearch_jax.search import BLACK_BOX, LABELS, POLICIES
+from vsearch_jax.search import LABELS, POLICIES
 
 CONFIG = Config.preset("smoke")
 CONTRACT = {
@@ -103,10 +103,9 @@ def test_results_agree_with_the_arrays(arrays: dict[str, Any], results: dict[str
 
 
 def test_means_of_one_trial_have_no_interval() -> None:
-    one = {name: made_up.trials((1,), 5) for name in BLACK_BOX}
     policy = made_up.trials((1, 1), 5)
-    results = report.summarize_results(one | {"sac": policy, "sac_assisted": policy}, CONFIG, {})
-    assert results["cma_es"]["evaluations_mean_ci95"] is None
+    results = report.summarize_results(made_up.evaluation() | {"sac": policy, "sac_assisted": policy}, CONFIG, {})
+    assert results["sac"]["evaluations_mean_ci95"] is None
     assert all(len(cells) == len(LABELS) for _, cells in table_rows(results))
 
 
@@ -128,6 +127,12 @@ def test_a_search_that_reached_no_view_has_no_mean_cosine(arrays: dict[str, Any]
 def test_the_policy_alone_and_with_help_have_rows_of_their_own(results: dict[str, Any]) -> None:
     assert results["sac_assisted"]["helped_rate"] == 0.25
     assert "helped_rate" not in results["sac"]
+
+
+def test_help_that_was_never_needed_is_reported_as_zero(arrays: dict[str, Any]) -> None:
+    never = arrays["sac_assisted"] | {"num_helped": np.zeros_like(arrays["sac_assisted"]["num_helped"])}
+    results = report.summarize_results(arrays | {"sac_assisted": never}, CONFIG, {})
+    assert results["sac_assisted"]["helped_rate"] == 0.0
 
 
 def test_what_helps_a_searcher_is_counted(results: dict[str, Any]) -> None:

@@ -49,7 +49,7 @@ def evaluation(num_seeds: int = 1) -> dict[str, Any]:
         "random_search": trials((24,), 30) | {"num_wide": count},
         "cma_es": trials((24,), 30, 1),
         "cma_es_restarts": trials((24,), 30, 2) | {"num_restarts": count},
-        "sac": policies | {"num_helped": np.zeros(shape, np.int32)},
+        "sac": policies,
         "sac_assisted": policies | {"num_helped": (np.arange(np.prod(shape)).reshape(shape) % 4 == 0).astype(np.int32)},
     }
 

@@ -65,7 +65,9 @@ def evaluate_policies(
 
     # One loop over both kinds, so that the episode is compiled once.
     outcomes = jax.lax.map(run_all, jnp.asarray(list(POLICIES.values())))
-    return {name: jax.tree.map(lambda x, i=i: x[i], outcomes) for i, name in enumerate(POLICIES)}
+    results = {name: jax.tree.map(lambda x, i=i: x[i], outcomes) for i, name in enumerate(POLICIES)}
+    del results["sac"]["num_helped"]  # nothing helps the policy alone
+    return results
 
 
 def run_episode(

@@ -51,8 +51,8 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
       - `initial_view` and `target_view`: View of f32 rad.
       - `num_wide` i32 of `random_search`: how often a wide sample became the best view.
       - `num_restarts` i32 of `cma_es_restarts`.
-      - `steps_lower_bound` i32 of the policies, see `steps_lower_bound`; and `num_helped` i32, steps that the local
-        search chose.
+      - `steps_lower_bound` i32 of the policies, see `steps_lower_bound`.
+      - `num_helped` i32 of `sac_assisted`: steps that the local search chose.
 
     Raises:
       ConfigError: the arm cannot reach the target view, or reaches no elevation at every azimuth.

@@ -46,9 +46,8 @@ def summarize_results(arrays: Mapping[str, Outcome], config: Config, wall_second
     num_views = config.evaluation.num_initial_views
     results: Results = {}
     for name in BLACK_BOX:
-        trials = to_trials(arrays[name])
-        clusters = num_views if trials["is_success"].size % num_views == 0 else trials["is_success"].size
-        results[name] = summarize_trials(_map_arrays(lambda x, n=clusters: x.reshape(n, -1, *x.shape[1:]), trials))
+        by_view = _map_arrays(lambda x: x.reshape(num_views, -1, *x.shape[1:]), to_trials(arrays[name]))
+        results[name] = summarize_trials(by_view)
     for name in POLICIES:
         results[name] = _summarize_policies(to_trials(arrays[name]), config)
     return results | {
@@ -78,12 +77,10 @@ def _summarize_policies(trials: Trials, config: Config) -> Results:
 
 def _num_images(config: Config) -> int:
     """Returns the number of images that the training of encoder and policies renders."""
-    encoder = config.encoder
-    return (
-        encoder.num_updates * encoder.batch_size
-        + encoder.pool_size
-        + (config.sac.num_seeds * config.sac.num_environment_steps)
-    )
+    encoder, sac = config.encoder, config.sac
+    per_example = 1 if encoder.loss == "pose" else 2  # the decoder's target is an image of its own
+    examples = encoder.num_updates * encoder.batch_size
+    return per_example * examples + encoder.pool_size + sac.num_seeds * sac.num_environment_steps
 
 
 def false_positive_warning(results: Results) -> str | None:
@@ -147,7 +144,7 @@ def summarize_trials(trials: Trials) -> Results:
         summary |= _mean("steps_lower_bound_mean", bound)
         summary["evaluations_over_lower_bound"] = float(evaluations.mean() / bound.mean())
         summary |= _rate("below_bound_rate", is_success & (evaluations < bound))
-    if "num_helped" in trials and trials["num_helped"].any():
+    if "num_helped" in trials:
         summary |= _rate("helped_rate", trials["num_helped"] > 0)
     return summary
 

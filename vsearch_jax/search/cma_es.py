@@ -95,8 +95,10 @@ def method(config: CMAESConfig) -> Method[CMAESState]:
     algorithm = build_algorithm(config)
     return Method(
         start=functools.partial(init_state, algorithm, config),
-        ask=functools.partial(_sample_views, algorithm),
-        tell=functools.partial(_update_state, algorithm),
+        ask=lambda key, args, state: sample_views(
+            algorithm, jax.random.fold_in(key, state.record.generation), args.band, state
+        ),
+        tell=functools.partial(update_state, algorithm),
         record=lambda state: state.record,
         num_views=config.population,
     )
@@ -127,34 +129,6 @@ def init_state(algorithm: Algorithm, config: CMAESConfig, args: SearchArgs[objec
     )
 
 
-def sample_population(algorithm: Algorithm, key: Array, strategy: Strategy) -> tuple[Array, Strategy]:
-    """Draws a generation: N points f32[N, 2] in units of the search space. Returns the strategy to go on with too.
-
-    Args:
-      algorithm: from `build_algorithm`.
-      key: PRNG key of this generation.
-      strategy: evosax's state.
-    """
-    with evosax_promotion():
-        return algorithm.cma_es.ask(key, strategy, algorithm.params)
-
-
-def update_strategy(
-    algorithm: Algorithm, key: Array, strategy: Strategy, population: Array, fitness: Array
-) -> Strategy:
-    """Adapts mean, sigma and covariance to the fitness of a generation of N points.
-
-    Args:
-      algorithm: from `build_algorithm`.
-      key: PRNG key, which evosax requires.
-      strategy: evosax's state that `sample_population` returned.
-      population: f32[N, 2], points of the generation, in units of the search space.
-      fitness: f32[N], fitness of the points; lower is better.
-    """
-    with evosax_promotion():
-        return algorithm.cma_es.tell(key, population, fitness, strategy, algorithm.params)[0]
-
-
 def fitness_of(population: Array, scores: Array, band: Array) -> Array:
     """Computes the fitness f32[N] of N points: 1 - score, plus the squared distance to the band.
 
@@ -167,24 +141,42 @@ def fitness_of(population: Array, scores: Array, band: Array) -> Array:
     return jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2
 
 
-def _sample_views(
-    algorithm: Algorithm, key: Array, args: SearchArgs[object], state: CMAESState
-) -> tuple[View, CMAESState]:
-    key = jax.random.fold_in(key, state.record.generation)
-    population, strategy = sample_population(algorithm, key, state.strategy)
-    views, _ = jax.vmap(to_view, in_axes=(0, None))(population, args.band)
+def sample_views(algorithm: Algorithm, key: Array, band: Array, state: CMAESState) -> tuple[View, CMAESState]:
+    """Draws a generation of N samples.
+
+    Args:
+      algorithm: from `build_algorithm`.
+      key: PRNG key of this generation.
+      band: f32[2] rad, lowest and highest elevation of the search.
+      state: the search before the generation.
+
+    Returns:
+      The views to observe, View of f32[N] rad; and the state that holds the generation.
+    """
+    with evosax_promotion():
+        population, strategy = algorithm.cma_es.ask(key, state.strategy, algorithm.params)
+    views, _ = jax.vmap(to_view, in_axes=(0, None))(population, band)
     return views, dataclasses.replace(state, strategy=strategy, population=population)
 
 
-def _update_state(
+def update_state(
     algorithm: Algorithm, key: Array, args: SearchArgs[object], state: CMAESState, views: View, scores: Array
 ) -> CMAESState:
+    """Records a generation of N samples, and adapts mean, sigma and covariance to it.
+
+    Args:
+      algorithm: from `build_algorithm`.
+      key: PRNG key, which evosax requires but does not use.
+      args: the search problem.
+      state: the state that `sample_views` returned.
+      views: the observed views, View of f32[N] rad.
+      scores: f32[N], scores of the views; -inf where the arm cannot reach a view.
+    """
     fitness = fitness_of(state.population, scores, args.band)
-    return dataclasses.replace(
-        state,
-        record=add_generation(state.record, views, scores, args.threshold),
-        strategy=update_strategy(algorithm, key, state.strategy, state.population, fitness),
-    )
+    with evosax_promotion():
+        strategy, _ = algorithm.cma_es.tell(key, state.population, fitness, state.strategy, algorithm.params)
+    record = add_generation(state.record, views, scores, args.threshold)
+    return dataclasses.replace(state, record=record, strategy=strategy)
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from jax import Array
 from vsearch_jax.config import CMAESConfig
 from vsearch_jax.search import cma_es
 from vsearch_jax.search.cma_es import Algorithm, CMAESState
-from vsearch_jax.search.common import Method, ScoreFn, SearchArgs, Task, add_generation, run_search
+from vsearch_jax.search.common import Method, ScoreFn, SearchArgs, Task, run_search
 from vsearch_jax.types import SearchResult, View
 from vsearch_jax.xla.tree import tree_where
 
@@ -88,9 +88,7 @@ def _generation_keys(key: Array, state: _State) -> tuple[Array, Array]:
 
 def _sample_views(algorithm: Algorithm, key: Array, args: SearchArgs[object], state: _State) -> tuple[View, _State]:
     sample_key, _ = _generation_keys(key, state)
-    population, strategy = cma_es.sample_population(algorithm, sample_key, state.base.strategy)
-    views, _ = jax.vmap(cma_es.to_view, in_axes=(0, None))(population, args.band)
-    base = dataclasses.replace(state.base, strategy=strategy, population=population)
+    views, base = cma_es.sample_views(algorithm, sample_key, args.band, state.base)
     return views, dataclasses.replace(state, base=base)
 
 
@@ -98,19 +96,16 @@ def _update_state(
     algorithm: Algorithm, key: Array, args: SearchArgs[object], state: _State, views: View, scores: Array
 ) -> _State:
     """Returns the state after the strategy's update and the restart rules of `search`."""
-    base = state.base
     sample_key, restart_key = _generation_keys(key, state)
-    fitness = cma_es.fitness_of(base.population, scores, args.band)
-    strategy = cma_es.update_strategy(algorithm, sample_key, base.strategy, base.population, fitness)
-    best = fitness.min()
+    base = cma_es.update_state(algorithm, sample_key, args, state.base, views, scores)
+    strategy, best = base.strategy, cma_es.fitness_of(base.population, scores, args.band).min()
     stalled = jnp.where(best < state.run_fitness - _MIN_IMPROVEMENT, 0, state.stalled + 1)
     largest_std = strategy.std * jnp.sqrt(jnp.linalg.eigvalsh(strategy.C)[-1])
     is_over = (stalled >= _STALL_GENERATIONS) | (largest_std < _SMALLEST_STD)
     point = jax.random.uniform(restart_key, (2,), minval=jnp.array([-2.0, -1.0]), maxval=jnp.array([2.0, 1.0]))
     strategy = tree_where(is_over, cma_es.init_strategy(algorithm, point), strategy)
-    record = add_generation(base.record, views, scores, args.threshold)
     return _State(
-        base=dataclasses.replace(base, record=record, strategy=strategy),
+        base=dataclasses.replace(base, strategy=strategy),
         run_fitness=jnp.where(is_over, jnp.inf, jnp.minimum(best, state.run_fitness)),
         stalled=jnp.where(is_over, 0, stalled),
         num_restarts=state.num_restarts + is_over.astype(jnp.int32),
