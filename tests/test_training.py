@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import vsearch_jax as vs
-from vsearch_jax import training
 from vsearch_jax.runs import checkpoint
 from vsearch_jax.runs.old_versions import current_names
+from vsearch_jax.training import run as training
 
 # Silhouettes need no light, which takes half of the renderer's compile time.
 SMOKE = vs.Config.preset("smoke")

@@ -53,6 +53,19 @@ def fold_into_band(elevation: Array, band: Array) -> Array:
     return jnp.where(width > 0.0, jnp.clip(folded, band[0], band[1]), band[0])
 
 
+def view_from_uniform(numbers: Array, band: Array) -> View:
+    """Converts numbers that are uniform in [0, 1] to views that are uniform in azimuth and in the band of elevations.
+
+    Args:
+      numbers: f32[2, ...] in [0, 1], for azimuth and elevation.
+      band: f32[2] rad, lowest and highest elevation.
+
+    Returns:
+      View of f32[...] rad.
+    """
+    return View(jnp.pi * (2.0 * numbers[0] - 1.0), band[0] + (band[1] - band[0]) * numbers[1])
+
+
 def view_pose(view: View, center: Array, radius: float | Array) -> SE3:
     """Returns the camera's pose in world (T_world_camera) for a view: the camera looks at `center`, image upright.
 

@@ -209,15 +209,17 @@ class SACState:
     Attributes:
       actor: parameters of the policy.
       critic: parameters of the twin Q networks, leading axis 2.
-      target_critic: moving average of `critic`, leading axis 2.
+      target_critic: moving average of `critic`, leading axis 2; or of `value` if there is one.
       log_alpha: f32[], logarithm of the temperature.
-      opt_states: optax states of actor, critic and log_alpha, in this order.
+      value: parameters of the state value network; None without one.
+      opt_states: optax states of actor, critic and third: `value` if there is one, else log_alpha.
     """
 
     actor: nnx.State
     critic: nnx.State
     target_critic: nnx.State
     log_alpha: Array
+    value: nnx.State | None
     opt_states: tuple[optax.OptState, optax.OptState, optax.OptState]
 
 

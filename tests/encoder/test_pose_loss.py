@@ -86,7 +86,16 @@ def test_matches_are_counted_as_by_loops():
     is_false = np.asarray(found) > 60.0
     assert 0.0 < is_false.mean() < 1.0
     assert float(measured["false_match_rate"]) == pytest.approx(is_false.mean(), abs=1e-6)
-    assert float(measured["threshold_angle_deg"]) == pytest.approx(np.median(found), rel=1e-3)
+
+
+def test_the_measured_threshold_angle_is_where_the_cosine_meets_the_threshold():
+    views_deg = np.random.default_rng(0).uniform(0.0, 40.0, 60)
+    angles = np.deg2rad(np.abs(views_deg[:, None] - views_deg[None]))
+    turns = np.deg2rad(3.0 * views_deg)  # of the codes: they turn by three degrees for each degree of the view
+    codes = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    measured = encoders.match_metrics(jnp.asarray(codes, jnp.float32), jnp.asarray(angles, jnp.float32), CONFIG, 4.0)
+    wanted = math.degrees(math.acos(CONFIG.env.threshold)) / 3.0
+    assert float(measured["threshold_angle_deg"]) == pytest.approx(wanted, rel=0.02)
 
 
 def test_without_a_match_the_measures_are_nan():

@@ -108,7 +108,7 @@ def test_the_strategy_equals_pycma(seed):
         d_std=step_size.damps,
         chi_n=math.sqrt(math.pi / 2.0),
     )
-    state = cma_es.init_strategy(cma_es.Algorithm(algorithm, params), jnp.zeros(2))
+    state = cma_es.init_strategy(cma_es.Algorithm(algorithm, params, has_bounds=True), jnp.zeros(2))
     state = dataclasses.replace(state, C=jnp.asarray(oracle.sm.C, jnp.float32))
     key = jax.random.key(0)
     for _ in range(15):
@@ -125,3 +125,27 @@ def test_the_strategy_equals_pycma(seed):
         np.testing.assert_allclose(state.p_c, oracle.pc, atol=1e-4)
         np.testing.assert_allclose(state.p_std, step_size.ps, atol=1e-4)
         np.testing.assert_allclose(state.C, oracle.sm.C, atol=1e-4)
+
+
+def test_with_a_penalty_samples_leave_the_band_and_are_counted_by_generation():
+    """A search in parts, as the evaluation runs it. Bounds keep all samples reachable; the penalty does not."""
+    problem = jax.tree.map(lambda x: x[0], probes.search_problems(INITIAL, TARGET))
+
+    def run(config):
+        method = cma_es.method(config)
+
+        def run_generation(state, _):
+            views, state = method.ask(KEYS[0], problem, state)
+            scores = jax.vmap(probes.unreachable_outside_band, in_axes=(0, None))(views, problem.task)
+            return method.tell(KEYS[0], problem, state, views, scores), jnp.sum(jnp.isneginf(scores))
+
+        start = method.start(problem, jnp.float32(0.0))
+        state, counts = jax.lax.scan(run_generation, start, length=config.max_generations)
+        return counts, method.counts(state)["unreachable_by_generation"]
+
+    counts, recorded = jax.jit(run, static_argnums=0)(CMAESConfig(constraint="penalty"))
+    np.testing.assert_array_equal(recorded, counts)
+    assert counts[0] > 0
+    assert counts[-5:].sum() < counts[:5].sum()  # it learns where the arm reaches (thesis, figure 5.11)
+    counts, recorded = jax.jit(run, static_argnums=0)(CONFIG)
+    np.testing.assert_array_equal(recorded, np.zeros(CONFIG.max_generations))

@@ -49,16 +49,19 @@ def bandit_batch(key, terminated=1.0) -> Transition:
     return Transition(obs, action, reward, obs, jnp.full((64,), terminated), jnp.ones(64))
 
 
-def test_a_bandit_with_continuous_contexts_is_solved():
-    state = train_on_batches(BANDIT, bandit_batch, 2000, 2)
+@pytest.mark.parametrize("algorithm", ["twin_q", "value"])
+def test_a_bandit_with_continuous_contexts_is_solved(algorithm):
+    config = dataclasses.replace(BANDIT, algorithm=algorithm)
+    state = train_on_batches(config, bandit_batch, 2000, 2)
     obs = jax.random.uniform(jax.random.key(9), (100, 2), minval=-0.7, maxval=0.7)
-    action = sac.act(None, state.actor, obs, BANDIT)
+    action = sac.act(None, state.actor, obs, config)
     assert float(jnp.abs(action - obs).mean()) < 0.1  # an untrained policy has 0.6
 
 
-def test_values_include_the_future_unless_a_step_terminates():
+@pytest.mark.parametrize("algorithm", ["twin_q", "value"])
+def test_values_include_the_future_unless_a_step_terminates(algorithm):
     """With reward 1 in each step, the value is 1 / (1 - discount). If every step terminates, the value is 1."""
-    config = dataclasses.replace(BANDIT, discount=0.5, tau=0.1, initial_temperature=1e-6)
+    config = dataclasses.replace(BANDIT, algorithm=algorithm, discount=0.5, tau=0.1, initial_temperature=1e-6)
 
     def batch_of(key, terminated):
         return bandit_batch(key, terminated)._replace(reward=jnp.ones(64))

@@ -93,6 +93,19 @@ def test_an_update_changes_the_target_critics_by_tau_and_the_temperature_towards
     assert float(new.log_alpha) < float(state.log_alpha)  # the entropy of a new policy is above -2 nats an entry
     high_entropy = dataclasses.replace(config, target_entropy=0.69)
     assert float(update(jax.random.key(1), state, batch, high_entropy)[0].log_alpha) > float(state.log_alpha)
+    assert np.isnan(metrics.pop("value_loss"))
+    assert all(np.isfinite(value) for value in metrics.values())
+
+
+def test_with_a_value_network_its_copy_changes_by_tau_and_the_temperature_stays():
+    config = dataclasses.replace(SMALL, algorithm="value", tau=0.25)
+    state = init(jax.random.key(0), config, 6)
+    new, metrics = update(jax.random.key(1), state, transitions([1.0, 0.0, -1.0, 0.5], [0, 1, 0, 0]), config)
+    expected = jax.tree.map(lambda old, now: 0.75 * old + 0.25 * now, state.target_critic, new.value)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), new.target_critic, expected)
+    changes = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), new.value, state.value)
+    assert max(jax.tree.leaves(changes)) > 0.0
+    assert float(new.log_alpha) == float(state.log_alpha)
     assert all(np.isfinite(value) for value in metrics.values())
 
 

@@ -96,7 +96,7 @@ def summarize_chunk(seconds: float, lines: Sequence[MetricsLine]) -> str:
     shown = {
         "loss": _LOSS_OF_STAGE[stage],
         "false matches": "false_match_rate",
-        "match angle (°)": "threshold_angle_deg",
+        "angle at the threshold (°)": "threshold_angle_deg",
         "reward": "reward",
         "success": "success_rate",
     }

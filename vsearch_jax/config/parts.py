@@ -113,6 +113,8 @@ class EncoderConfig:
 class EnvConfig:
     """The view-search task (thesis 4.3)."""
 
+    target: Literal["random", "fixed"] = "random"
+    """Target of an episode. random: any reachable view. fixed: the evaluation's target view (thesis)."""
     threshold: float = 0.98
     """Cosine similarity at which a view counts as found."""
     action_scale_deg: float = 30.0
@@ -129,6 +131,7 @@ class EnvConfig:
     """Motion of the arm. kinematic: the joints are set. dynamic: the arm's simulated dynamics follow the path."""
 
     def __post_init__(self) -> None:
+        require(self, "target", self.target in ("random", "fixed"), "random or fixed")
         require(self, "threshold", -1.0 < self.threshold < 1.0, "between -1 and 1")
         require(self, "reachable", self.reachable in ("ik", "path"), "ik or path")
         require(self, "motion", self.motion in ("kinematic", "dynamic"), "kinematic or dynamic")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from vsearch_jax.config.validation import require, require_finite, require_positive, require_unit
 
@@ -36,8 +37,11 @@ class CMAESConfig:
     """Initial standard deviation of the azimuth, in degrees."""
     max_generations: int = 30
     """Number of generations after which the search gives up."""
+    constraint: Literal["bounds", "penalty"] = "bounds"
+    """bounds: samples are moved into the band. penalty: samples may be anywhere; unreachable ones cost 5 (thesis)."""
 
     def __post_init__(self) -> None:
+        require(self, "constraint", self.constraint in ("bounds", "penalty"), "bounds or penalty")
         require(self, "population", self.population >= 4, "4 or more")
         require_positive(self, "sigma_deg", "max_generations")
 
@@ -46,6 +50,8 @@ class CMAESConfig:
 class SACConfig:
     """Soft actor-critic with goal relabelling (thesis 4.3)."""
 
+    algorithm: Literal["twin_q", "value"] = "twin_q"
+    """twin_q: target critics, temperature adapts. value: state value network, temperature is fixed (thesis)."""
     num_seeds: int = 1
     """Number of policies trained side by side. Each one has its own random numbers."""
     num_envs: int = 16
@@ -65,15 +71,18 @@ class SACConfig:
     discount: float = 0.9
     """Discount of future rewards for each step."""
     initial_temperature: float = 0.1
-    """Initial temperature, the weight of the entropy. Training adapts it."""
+    """Initial temperature, the weight of the entropy. With algorithm `value` it stays."""
     target_entropy: float = -2.0
     """Target of the policy's entropy for each entry of the action, in nats. A uniform action has 0.69."""
     tau: float = 0.02
     """Rate of the target critic's moving average."""
+    pool_fraction: float = 0.5
+    """Fraction of a batch that are steps between views of the pool, which need no new image."""
     relabel_fraction: float = 0.8
-    """Fraction of a batch that gets a new target. 2/3 of it get a random view, 1/3 the view that the step reached."""
+    """Fraction of the replayed steps with a new target: 2/3 of it a random view, 1/3 the view that the step reached."""
 
     def __post_init__(self) -> None:
+        require(self, "algorithm", self.algorithm in ("twin_q", "value"), "twin_q or value")
         require_positive(
             self,
             "num_seeds",
@@ -87,7 +96,9 @@ class SACConfig:
         )
         is_positive = len(self.hidden_sizes) > 0 and min(self.hidden_sizes) > 0
         require(self, "hidden_sizes", is_positive, "one or more counts, all greater than 0")
-        require_unit(self, "discount", "relabel_fraction", "tau")
+        require_unit(self, "discount", "pool_fraction", "relabel_fraction", "tau")
+        allowed = f"below {1.0 - 0.5 / self.batch_size:g}, so that a batch of {self.batch_size} holds a real step"
+        require(self, "pool_fraction", round(self.pool_fraction * self.batch_size) < self.batch_size, allowed)
         require_finite(self, "target_entropy")
         require(
             self,

@@ -99,16 +99,19 @@ def match_metrics(codes: Array, angles: Array, config: Config, limit_deg: float)
       limit_deg: a match whose angle is larger is false.
 
     Returns:
-      `false_match_rate` f32[], share of the matches that are false; and `threshold_angle_deg` f32[], median angle of
-      the matches in degrees. Both are NaN without a match.
+      `false_match_rate` f32[], share of the matches that are false, NaN without a match. `threshold_angle_deg` f32[],
+      angle in degrees at which the cosine meets the threshold, NaN without pairs within the limit. It is a fit to these
+      pairs: 1 - cosine grows with the square of the angle.
     """
     is_other = ~jnp.eye(angles.shape[0], dtype=bool)
-    is_match = (code_cosines(codes) >= config.env.threshold) & is_other
+    cosines = code_cosines(codes)
+    is_match = (cosines >= config.env.threshold) & is_other
     is_false = is_match & (angles > math.radians(limit_deg))
-    median = jnp.nanmedian(jnp.where(is_match, angles, jnp.nan))
+    is_near = is_other & (angles <= math.radians(limit_deg))
+    slope = jnp.sum(jnp.where(is_near, 1.0 - cosines, 0.0)) / jnp.sum(jnp.where(is_near, angles**2, 0.0))
     return {
         "false_match_rate": jnp.sum(is_false) / jnp.sum(is_match),
-        "threshold_angle_deg": jnp.rad2deg(median),
+        "threshold_angle_deg": jnp.rad2deg(jnp.sqrt((1.0 - config.env.threshold) / slope)),
     }
 
 

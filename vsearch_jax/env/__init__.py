@@ -8,6 +8,7 @@ from vsearch_jax.env.episode import (
     episode_of,
     obs_of,
     pose_error,
+    protocol_target,
     step_reward,
     zero_observation,
 )
@@ -25,6 +26,7 @@ __all__ = [
     "episode_of",
     "obs_of",
     "pose_error",
+    "protocol_target",
     "random_example_views",
     "step_reward",
     "zero_observation",

@@ -166,6 +166,18 @@ def step_reward(similarity: Array, is_reachable: Array, config: EnvConfig) -> tu
     return jnp.where(is_reachable, reward, config.unreachable_reward), is_found
 
 
+def protocol_target(config: Config) -> View:
+    """Returns the view that the evaluated random searches and CMA-ES searches look for: a View of f32[] rad.
+
+    With `env.target` "fixed" it is also the target of every episode.
+
+    Args:
+      config: the run's config; `evaluation` is read.
+    """
+    settings = config.evaluation
+    return View(wrap_angle(jnp.deg2rad(settings.target_azimuth_deg)), jnp.deg2rad(settings.target_elevation_deg))
+
+
 def commanded_view(view: View, action: Array, action_scale_deg: float) -> View:
     """Returns the view that an action asks for: the present view plus the action's change. It may be unreachable.
 

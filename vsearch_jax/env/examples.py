@@ -14,11 +14,12 @@ from mujoco import mjx
 from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.env.task import ViewSearchEnv
-from vsearch_jax.geometry import fold_into_band, wrap_angle
+from vsearch_jax.geometry import fold_into_band, view_from_uniform, wrap_angle
 from vsearch_jax.types import Camera, View
+from vsearch_jax.xla.tree import tree_where
 
-_NEIGHBOUR_DEG = 8.0
-"""Standard deviation of the offsets of neighbours, in azimuth and elevation."""
+_NEIGHBOUR_DEG, _CLEAN_NEIGHBOUR_DEG = 8.0, 2.0
+"""Standard deviation of the offsets of neighbours, in azimuth and elevation: augmented views, and clean views."""
 
 
 class EncoderExample(NamedTuple):
@@ -35,7 +36,7 @@ class EncoderExample(NamedTuple):
     rotation: Array
 
 
-def random_example_views(key: Array, env: ViewSearchEnv) -> View:
+def random_example_views(key: Array, env: ViewSearchEnv, is_clean: Array) -> View:
     """Draws the views of a batch of B examples: one half uniform over the band, the other half their partners.
 
     For the pose loss half of the partners are neighbours of their view. The other half are neighbours of the view
@@ -44,18 +45,19 @@ def random_example_views(key: Array, env: ViewSearchEnv) -> View:
     Args:
       key: PRNG key.
       env: the task.
+      is_clean: bool[], the views will be clean. Then neighbours are closer, so that many pairs match.
 
     Returns:
       Views of f32[B] rad.
     """
-    config, low, high = env.config.encoder, env.reach.band[0], env.reach.band[1]
+    config = env.config.encoder
     uniform_key, offset_key = jax.random.split(key)
-    numbers = jax.random.uniform(uniform_key, (2, config.batch_size))
-    views = View(jnp.pi * (2.0 * numbers[0] - 1.0), low + (high - low) * numbers[1])
+    views = view_from_uniform(jax.random.uniform(uniform_key, (2, config.batch_size)), env.reach.band)
     if config.loss == "autoencoder":
         return views
     half = config.batch_size // 2
-    offset = math.radians(_NEIGHBOUR_DEG) * jax.random.normal(offset_key, (2, half))
+    std = jnp.where(is_clean, math.radians(_CLEAN_NEIGHBOUR_DEG), math.radians(_NEIGHBOUR_DEG))
+    offset = std * jax.random.normal(offset_key, (2, half))
     turn = jnp.where(jnp.arange(half) < half // 2, 0.0, jnp.pi)
     first = jax.tree.map(lambda x: x[: config.batch_size - half], views)
     partners = View(
@@ -65,7 +67,7 @@ def random_example_views(key: Array, env: ViewSearchEnv) -> View:
     return jax.tree.map(lambda *x: jnp.concatenate(x), first, partners)
 
 
-def encoder_example(key: Array, view: View, *, env: ViewSearchEnv) -> EncoderExample:
+def encoder_example(key: Array, view: View, is_clean: Array, *, env: ViewSearchEnv) -> EncoderExample:
     """Renders one training example of the encoder from a view, with random joint values of the arm.
 
     The clean target has no shadows, so the encoder learns to ignore the arm's shadow.
@@ -73,6 +75,7 @@ def encoder_example(key: Array, view: View, *, env: ViewSearchEnv) -> EncoderExa
     Args:
       key: PRNG key of joint values, lights, camera jitter and image augmentation.
       view: the view, f32[] rad. If the arm cannot reach it, the nearest reachable view of the map's grid replaces it.
+      is_clean: bool[], the input is the image as a search sees it, without random lights, jitter and augmentation.
       env: the task. Scene and arm are used, the encoder in it is not.
     """
     pose_key, light_key, camera_key, image_key = jax.random.split(key, 4)
@@ -82,9 +85,12 @@ def encoder_example(key: Array, view: View, *, env: ViewSearchEnv) -> EncoderExa
 
     size = env.config.scene.image_size
     lit_scene = encoders.randomize_lights(light_key, env.render_scene, env.center)
-    image = render.render(lit_scene, data, encoders.jitter_camera(camera_key, camera), (size, size))
+    lit_scene = tree_where(is_clean, env.render_scene, lit_scene)
+    jittered = tree_where(is_clean, camera, encoders.jitter_camera(camera_key, camera))
+    image = render.render(lit_scene, data, jittered, (size, size))
     pixels = encoders.network_input(image, object_ids, env.config)
     inputs = encoders.augment_input(image_key, pixels, render.silhouette(image, env.scene.object_geom_ids), env.config)
+    inputs = jnp.where(is_clean, pixels, inputs)
     target = None if env.config.encoder.loss == "pose" else _clean_target(env, data, camera)
     return EncoderExample(inputs, target, camera.rotation)
 

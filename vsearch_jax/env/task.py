@@ -13,8 +13,10 @@ from mujoco import mjx
 from vsearch_jax import encoder as encoders
 from vsearch_jax import render
 from vsearch_jax.config import Config
+from vsearch_jax.env import episode as episodes
 from vsearch_jax.env import motion as motions
-from vsearch_jax.env.episode import check_band, commanded_view, episode_of, next_state, start_state
+from vsearch_jax.env.episode import check_band, episode_of
+from vsearch_jax.geometry import view_from_uniform
 from vsearch_jax.planning import Motion, Trajectory, nearest_cell, reachability_map, solve_view
 from vsearch_jax.planning.execution import check_drive
 from vsearch_jax.robot.arm import build_arm, camera_pose, forward_kinematics
@@ -90,14 +92,14 @@ class ViewSearchEnv(Env):
     # -- episode ------------------------------------------------------------------------------------------------------
 
     def reset(self, rng: Array) -> State:
-        """Starts an episode: returns its brax State. Initial and target view are random reachable views.
+        """Starts an episode with random ends (see `random_end`): returns its brax State.
 
         Args:
           rng: PRNG key (brax's name for it).
         """
-        observations = jax.vmap(self.random_observation)(jax.random.split(rng))
-        initial, target = (jax.tree.map(lambda x, i=i: x[i], observations) for i in range(2))
-        return self.start(initial, target)
+        views, qpos = jax.vmap(self.random_end)(jax.random.split(rng), jnp.arange(2) == 1)
+        observations = jax.vmap(self.observe_view)(views, qpos)
+        return self.start(*(jax.tree.map(lambda x, i=i: x[i], observations) for i in range(2)))
 
     def start(self, observation: Observation, target: Observation) -> State:
         """Starts an episode with given observations: returns its brax State.
@@ -106,7 +108,7 @@ class ViewSearchEnv(Env):
           observation: what the wrist camera sees from the initial view.
           target: what the wrist camera sees from the target view.
         """
-        return start_state(observation, target)
+        return episodes.start_state(observation, target)
 
     def step(self, state: State, action: Array) -> State:
         """Moves the camera by an action, and returns the brax State after it. If `done` is set, nothing changes.
@@ -128,7 +130,7 @@ class ViewSearchEnv(Env):
           state: brax State before the action.
           action: f32[2], change of azimuth and elevation in units of `env.action_scale_deg`; clipped to [-1, 1].
         """
-        return commanded_view(episode_of(state).observation.view, action, self.config.env.action_scale_deg)
+        return episodes.commanded_view(episode_of(state).observation.view, action, self.config.env.action_scale_deg)
 
     def apply_transition(self, state: State, observation: Observation, motion: Motion) -> State:
         """Builds the brax State after one step from its observation: reward, `done`, metrics.
@@ -138,7 +140,7 @@ class ViewSearchEnv(Env):
           observation: what the wrist camera sees from the commanded view; ignored if `motion` is not found.
           motion: cost of the motion to that view, and whether it was found. If not, the arm stays.
         """
-        return next_state(state, observation, motion, self.config.env)
+        return episodes.next_state(state, observation, motion, self.config.env)
 
     # -- views and configurations -------------------------------------------------------------------------------------
 
@@ -161,13 +163,20 @@ class ViewSearchEnv(Env):
         )
         return result.qpos, is_reachable
 
-    def random_pose(self, key: Array) -> tuple[View, Array]:
-        """Draws a random view that the arm reaches, and joint values f32[nq] rad or m that reach it.
+    def random_end(self, key: Array, is_target: Array) -> tuple[View, Array]:
+        """Draws a view at which an episode starts or ends, and joint values f32[nq] rad or m that reach it.
 
         The view is uniform over the band (elevations reachable at every azimuth). The joint values are the IK solution
         nearest to random ones. If IK fails, the nearest reachable view of the reachability map's grid is returned.
+
+        Args:
+          key: PRNG key.
+          is_target: bool[], whether the episode ends at the view. With `env.target` "fixed" it is the fixed target.
         """
-        view, qpos, _ = self.resolve_view(*self.random_view(key), jnp.bool_(False))
+        view, qpos = self.random_view(key)
+        if self.config.env.target == "fixed":
+            view = tree_where(is_target, episodes.protocol_target(self.config), view)
+        view, qpos, _ = self.resolve_view(view, qpos, jnp.bool_(False))
         return view, qpos
 
     def resolve_view(self, view: View, qpos: Array, is_fixed: Array) -> tuple[View, Array, Array]:
@@ -193,9 +202,7 @@ class ViewSearchEnv(Env):
         """Draws a view, uniform over the reachable band, and joint values f32[nq] rad or m, unrelated to the view."""
         # One draw for all numbers, because each draw adds much compile time.
         numbers = jax.random.uniform(key, (2 + self.scene.mj_model.nq,))
-        low, high = self.reach.band
-        view = View(jnp.pi * (2.0 * numbers[0] - 1.0), low + (high - low) * numbers[1])
-        return view, motions.joints_from_uniform(self.arm, numbers[2:])
+        return view_from_uniform(numbers[:2], self.reach.band), motions.joints_from_uniform(self.arm, numbers[2:])
 
     def random_joints(self, key: Array) -> Array:
         """Draws random joint values f32[nq] rad or m.
@@ -203,11 +210,6 @@ class ViewSearchEnv(Env):
         The joints that move the camera are uniform inside their limits. The other joints have their home values.
         """
         return motions.joints_from_uniform(self.arm, jax.random.uniform(key, (self.scene.mj_model.nq,)))
-
-    def random_observation(self, key: Array) -> Observation:
-        """Draws a random view that the arm reaches, and returns what the wrist camera sees from there."""
-        view, qpos = self.random_pose(key)
-        return self.observe_view(view, qpos)
 
     # -- motions ------------------------------------------------------------------------------------------------------
 

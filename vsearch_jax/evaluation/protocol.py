@@ -12,13 +12,12 @@ from jax import Array
 from jax.core import Tracer
 
 from vsearch_jax.config import Config
-from vsearch_jax.env import UnreachableError, ViewSearchEnv, check_band
+from vsearch_jax.env import UnreachableError, ViewSearchEnv, check_band, protocol_target
 from vsearch_jax.evaluation.episodes import episode_keys, evaluate_policies
-from vsearch_jax.evaluation.outcome import Outcome, measure_outcome
+from vsearch_jax.evaluation.outcome import Outcome
 from vsearch_jax.evaluation.step_bound import band_grid
 from vsearch_jax.evaluation.trials import search_trials
-from vsearch_jax.evaluation.views import ViewRequest, initial_views, observe_request, protocol_target
-from vsearch_jax.geometry import cosine_similarity
+from vsearch_jax.evaluation.views import ViewRequest, initial_views, observe_request
 from vsearch_jax.search import BLACK_BOX
 from vsearch_jax.types import Observation, ReachabilityMap, TrainState
 from vsearch_jax.xla.batching import map_in_batches
@@ -51,6 +50,7 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
       - `initial_view` and `target_view`: View of f32 rad.
       - `num_wide` i32 of `random_search`: how often a wide sample became the best view.
       - `num_restarts` i32 of `cma_es_restarts`.
+      - `unreachable_by_generation` i32[..., G] of both forms of CMA-ES: samples that the arm could not reach.
       - `steps_lower_bound` i32 of the policies, see `steps_lower_bound`.
       - `num_helped` i32 of `sac_assisted`: steps that the local search chose.
 
@@ -96,18 +96,9 @@ def _evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
 
     reset_keys, search_keys = episode_keys(policy_key, config)
     initial, grid, target, ends = observe_known_views(known_views_key, reset_keys, env, config)
-    similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(initial.code, target.code)
-    # The code of an initial view that the arm cannot reach is all zeros.
-    starts = (initial, jnp.where(jnp.any(initial.code != 0.0, axis=-1), similarity, -jnp.inf))
-
     methods = tuple(build(config) for build in BLACK_BOX.values())
-    trials = search_trials(jax.random.split(search_key, len(methods)), env, methods, starts, target)
-    target_views = jax.tree.map(lambda x: jnp.broadcast_to(x, starts[1].shape), target.view)
-    measure_trials = jax.vmap(measure_outcome, in_axes=(None, 0, 0, None))
-    outcomes: dict[str, Outcome] = {}
-    for name, (result, motions, counts, camera) in zip(BLACK_BOX, trials, strict=True):
-        measured: Outcome = measure_trials(env, result, camera, target.camera)
-        outcomes[name] = measured | motions | counts | {"initial_view": initial.view, "target_view": target_views}
+    trials = search_trials(jax.random.split(search_key, len(methods)), env, methods, initial, target)
+    outcomes = dict(zip(BLACK_BOX, trials, strict=True))
     return outcomes | evaluate_policies(env, state, (search_keys, ends), grid)
 
 
@@ -154,4 +145,9 @@ def observe_known_views(key: Array, reset_keys: Array, env: ViewSearchEnv, confi
     num_trials, num_fixed = views.azimuth.shape[0], keys.shape[0]
     parts = (slice(num_trials), slice(num_trials, num_fixed - 1), num_fixed - 1, slice(num_fixed, None))
     known = KnownViews(*(jax.tree.map(lambda x, part=part: x[part], observations) for part in parts))
-    return known._replace(ends=jax.tree.map(lambda x: x.reshape(*reset_keys.shape, *x.shape[1:]), known.ends))
+    ends = jax.tree.map(lambda x: x.reshape(*reset_keys.shape, *x.shape[1:]), known.ends)
+    if config.env.target == "fixed":
+        ends = jax.tree.map(
+            lambda x, target: x.at[..., 1, *[slice(None)] * target.ndim].set(target), ends, known.target
+        )
+    return known._replace(ends=ends)

@@ -13,8 +13,8 @@ from brax.envs.base import State
 from jax import Array
 
 from vsearch_jax.config import Config
-from vsearch_jax.env import ViewSearchEnv, episode_of
-from vsearch_jax.evaluation.views import ViewRequest, observe_request, protocol_target
+from vsearch_jax.env import ViewSearchEnv, episode_of, protocol_target
+from vsearch_jax.evaluation.views import ViewRequest, observe_request
 from vsearch_jax.geometry import wrap_angle
 from vsearch_jax.search import sac
 from vsearch_jax.types import TrainState, View

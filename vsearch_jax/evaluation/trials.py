@@ -10,50 +10,49 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.env import ViewSearchEnv
+from vsearch_jax.evaluation.outcome import Outcome, measure_outcome
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
 from vsearch_jax.search.common import is_running, taken_images, to_result
-from vsearch_jax.types import Camera, Observation, SearchResult, View
-from vsearch_jax.xla.batching import map_in_batches
-from vsearch_jax.xla.tree import tree_where
-
-
-class TrialResults(NamedTuple):
-    """Results of one searcher. A trial is one search; each array has a leading axis of N trials.
-
-    Attributes:
-      result: best view, score and number of images of each trial.
-      motions: cost of each trial's motions: `joint_travel` f32[N] rad, `motion_time` f32[N] s, `num_plans` i32[N].
-      counts: the searcher's own counts by name, i32[N] each; see `Method.counts`.
-      camera: camera in world at the best view of each trial.
-    """
-
-    result: SearchResult
-    motions: dict[str, Array]
-    counts: dict[str, Array]
-    camera: Camera
+from vsearch_jax.types import Camera, Observation, View
+from vsearch_jax.xla import lane_pool
+from vsearch_jax.xla.tree import tree_where, tree_zeros
 
 
 class _Bench(NamedTuple):
-    """What all trials of one searcher share. It holds functions too, so it is no pytree.
+    """What all trials share. It holds functions too, so it is no pytree.
 
     Attributes:
       env: the task.
       methods: all searchers, each in parts.
-      number: i32[], index into `methods` of the searcher that runs.
       target: Observation of the target.
     """
 
     env: ViewSearchEnv
     methods: tuple[Method, ...]
-    number: Array
     target: Observation
 
     @property
     def num_views(self) -> int:
         """Views of a generation, padded to the largest of all searchers."""
         return max(method.num_views for method in self.methods)
+
+
+class _Problem(NamedTuple):
+    """A trial to run.
+
+    Attributes:
+      number: i32[], index into `_Bench.methods` of the searcher that runs.
+      key: PRNG key of the search.
+      start: Observation from the initial view.
+      score: f32[], score of the initial view.
+    """
+
+    number: Array
+    key: Array
+    start: Observation
+    score: Array
 
 
 class _Trial(NamedTuple):
@@ -64,75 +63,96 @@ class _Trial(NamedTuple):
       camera: Camera at the best view.
       qpos: f32[nq] rad or m, present joints of the arm.
       costs: f32[2], travel in rad and duration in s, summed over the motions so far.
+      is_over: bool[], the search has ended.
     """
 
     states: tuple[object, ...]
     camera: Camera
     qpos: Array
     costs: Array
+    is_over: Array
 
 
 def search_trials(
-    keys: Array, env: ViewSearchEnv, methods: tuple[Method, ...], starts: tuple[Observation, Array], target: Observation
-) -> list[TrialResults]:
-    """Runs all trials of the black-box searchers: one search by every searcher from each of N initial views.
+    keys: Array, env: ViewSearchEnv, methods: tuple[Method, ...], initial: Observation, target: Observation
+) -> list[Outcome]:
+    """Runs all trials of the black-box searchers, one search by every searcher from each of N initial views.
 
-    The searchers run one after another, and the trials of one searcher in batches. All searchers share one call of the
-    renderer, since each call is compiled anew.
+    The trials of all searchers are one queue, and run on a pool of lanes: a lane takes the next trial as soon as its
+    own ends. All searchers share one call of the renderer, since each call is compiled anew.
 
     Args:
       keys: PRNG keys [len(methods)], one for each searcher.
       env: the task.
       methods: the searchers, each in parts (start, ask, tell, record).
-      starts: what the camera sees from the N initial views (Observation of f32[N, ...]), and the views' scores f32[N].
+      initial: what the camera sees from the N initial views, Observation of f32[N, ...]. The code of a view that the
+        arm cannot reach is all zeros.
       target: what the camera sees from the target view.
 
     Returns:
-      Results of the N trials, for each searcher in the order of `methods`.
+      Measures of the N trials, for each searcher in the order of `methods`; `evaluate` describes them.
     """
+    bench, shape = _Bench(env, methods, target), (len(methods), initial.code.shape[0])
+    similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(initial.code, target.code)
+    starts = (initial, jnp.where(jnp.any(initial.code != 0.0, axis=-1), similarity, -jnp.inf))
+    trial_keys = jax.vmap(functools.partial(jax.random.split, num=shape[1]))(keys)
+    numbers = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
+    all_starts = jax.tree.map(lambda x: jnp.broadcast_to(x, (shape[0], *x.shape)), starts)
+    problems = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), _Problem(numbers, trial_keys, *all_starts))
+
     # With "path" the views of a generation are observed one after another, so they need no room in the batch.
-    num_views = 1 if env.config.env.reachable == "path" else max(method.num_views for method in methods)
-    batch_size = max(1, env.config.evaluation.batch_size // num_views)
+    num_views = 1 if env.config.env.reachable == "path" else bench.num_views
+    num_lanes = max(1, min(env.config.evaluation.batch_size // num_views, numbers.size))
+    lanes = jax.vmap(functools.partial(_start_trial, bench))(jax.tree.map(lambda x: x[:num_lanes], problems))
+    trials = tree_zeros(jax.tree.map(lambda x: x[0], lanes), (numbers.size,))
+    job = lane_pool.Job(
+        reset=lambda problem, trial, is_new: tree_where(is_new, _start_trial(bench, problem), trial),
+        step=lambda problem, trial: tree_where(trial.is_over, trial, _run_generation(bench, problem, trial)),
+        is_done=lambda trial: trial.is_over,
+        result=lambda _, trial: trial,
+        has_stragglers=False,  # to compile the renderer once more takes longer than the last generations on all lanes
+    )
+    trials = lane_pool.run(job, problems, lane_pool.queue_where(jnp.ones(numbers.size, bool)), lanes, trials)
 
-    def run_trials_of_searcher(searcher: tuple[Array, Array]) -> _Trial:
-        number, key = searcher
-        run_trial = functools.partial(_run_trial, _Bench(env, methods, number, target))
-        return map_in_batches(run_trial, (jax.random.split(key, starts[1].shape[0]), starts), batch_size)
-
-    trials = jax.lax.map(run_trials_of_searcher, (jnp.arange(len(methods)), keys))
-    results = []
+    target_views = jax.tree.map(lambda x: jnp.broadcast_to(x, shape[1:]), target.view)
+    measure = jax.vmap(functools.partial(measure_outcome, env), in_axes=(0, 0, None))
+    outcomes: list[Outcome] = []
     for number, method in enumerate(methods):
         own = (trials.states[number], trials.camera, trials.costs)
-        states, camera, costs = jax.tree.map(lambda x, n=number: x[n], own)
+        rows = slice(number * shape[1], (number + 1) * shape[1])
+        states, camera, costs = jax.tree.map(lambda x, rows=rows: x[rows], own)
         result = jax.vmap(to_result)(method.record(states))
         # The image of the initial view needs no motion.
         motions = {"joint_travel": costs[:, 0], "motion_time": costs[:, 1], "num_plans": result.evaluations - 1}
-        results.append(TrialResults(result, motions, jax.vmap(method.counts)(states), camera))
-    return results
+        views: Outcome = {"initial_view": initial.view, "target_view": target_views}
+        outcomes.append(measure(result, camera, target.camera) | jax.vmap(method.counts)(states) | motions | views)
+    return outcomes
 
 
-def _run_trial(bench: _Bench, item: tuple[Array, tuple[Observation, Array]]) -> _Trial:
-    """Runs one trial to its end; `item` is its key, initial observation and initial score."""
-    key, (start, score) = item
-    env = bench.env
-    args = SearchArgs(
-        initial=start.view, band=env.reach.band, threshold=jnp.asarray(env.config.env.threshold), task=None
-    )
-    states = tuple(method.start(args, score) for method in bench.methods)
-    body = functools.partial(_run_generation, bench, key, args)
-    condition = functools.partial(_is_trial_running, bench, args)
-    return jax.lax.while_loop(condition, body, _Trial(states, start.camera, start.qpos, jnp.zeros(2)))
+def _search_args(bench: _Bench, problem: _Problem) -> SearchArgs[None]:
+    """Returns the search problem of a trial."""
+    threshold = jnp.asarray(bench.env.config.env.threshold)
+    return SearchArgs(initial=problem.start.view, band=bench.env.reach.band, threshold=threshold, task=None)
 
 
-def _is_trial_running(bench: _Bench, args: SearchArgs, trial: _Trial) -> Array:
-    """Returns bool[]: the running searcher has not finished the trial."""
-    records = [method.record(state) for method, state in zip(bench.methods, trial.states, strict=True)]
-    return jnp.stack([is_running(record, args.threshold) for record in records])[bench.number]
+def _start_trial(bench: _Bench, problem: _Problem) -> _Trial:
+    args = _search_args(bench, problem)
+    states = tuple(method.start(args, problem.score) for method in bench.methods)
+    is_over = _is_over(bench, problem, states)
+    return _Trial(states, problem.start.camera, problem.start.qpos, jnp.zeros(2), is_over)
 
 
-def _run_generation(bench: _Bench, key: Array, args: SearchArgs, trial: _Trial) -> _Trial:
+def _is_over(bench: _Bench, problem: _Problem, states: tuple[object, ...]) -> Array:
+    """Returns bool[]: the running searcher has finished the trial."""
+    records = [method.record(state) for method, state in zip(bench.methods, states, strict=True)]
+    threshold = _search_args(bench, problem).threshold
+    return ~jnp.stack([is_running(record, threshold) for record in records])[problem.number]
+
+
+def _run_generation(bench: _Bench, problem: _Problem, trial: _Trial) -> _Trial:
     """Asks the running searcher for views, observes them and tells it the scores."""
     methods, numbers = bench.methods, range(len(bench.methods))
+    key, args = problem.key, _search_args(bench, problem)
 
     def ask(i: int, states: tuple[object, ...]) -> tuple[View, tuple[object, ...]]:
         """Returns the views of searcher `i`, padded to `bench.num_views`, and the new states."""
@@ -147,20 +167,19 @@ def _run_generation(bench: _Bench, key: Array, args: SearchArgs, trial: _Trial) 
         state = methods[i].tell(key, args, states[i], own, scores)
         return (*states[:i], state, *states[i + 1 :]), methods[i].record(state).best
 
-    views, states = jax.lax.switch(bench.number, [functools.partial(ask, i) for i in numbers], trial.states)
+    views, states = jax.lax.switch(problem.number, [functools.partial(ask, i) for i in numbers], trial.states)
     # Padding is not observed.
-    is_requested = jnp.arange(bench.num_views) < jnp.asarray([method.num_views for method in methods])[bench.number]
-    is_over = ~_is_trial_running(bench, args, trial)
+    is_requested = jnp.arange(bench.num_views) < jnp.asarray([method.num_views for method in methods])[problem.number]
     observations, motions, scores = _observe_generation(
-        bench, (trial.qpos, is_over), (views, is_requested), args.threshold
+        bench, (trial.qpos, trial.is_over), (views, is_requested), args.threshold
     )
     # The arm does not move to padding, nor to views after the one that ends the search.
     is_moved = motions.is_found & taken_images(scores, args.threshold) & is_requested
     qpos, costs = _add_motion_costs(bench.env, trial, observations.qpos, motions._replace(is_found=is_moved))
-    states, best = jax.lax.switch(bench.number, [functools.partial(tell, i) for i in numbers], states, views, scores)
+    states, best = jax.lax.switch(problem.number, [functools.partial(tell, i) for i in numbers], states, views, scores)
     best_camera = jax.tree.map(lambda x: x[best], observations.camera)
     camera = tree_where(best >= 0, best_camera, trial.camera)
-    return _Trial(states, camera, qpos, costs)
+    return _Trial(states, camera, qpos, costs, _is_over(bench, problem, states))
 
 
 def _observe_generation(

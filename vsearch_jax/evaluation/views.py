@@ -32,12 +32,6 @@ def initial_views(config: Config, band: Array) -> View:
     return View(azimuth, band[0] + (band[1] - band[0]) * (2.0 * (number % 3) + 1.0) / 6.0)
 
 
-def protocol_target(config: Config) -> View:
-    """Returns the view that the evaluated random searches and CMA-ES searches look for: a View of f32[] rad."""
-    settings = config.evaluation
-    return View(wrap_angle(jnp.deg2rad(settings.target_azimuth_deg)), jnp.deg2rad(settings.target_elevation_deg))
-
-
 class ViewRequest(NamedTuple):
     """A request for the observation of one view.
 

@@ -23,7 +23,7 @@ THESIS_BAND_DEG = (40, 70)
 _ENCODER_PANELS = {
     "encoder_loss": "encoder loss",
     "false_match_rate": "share of matches > 10° off",
-    "threshold_angle_deg": "angle of matches, median (°)",
+    "threshold_angle_deg": "angle at the threshold (°)",
 }
 _POLICY_PANELS = {
     "reward": "reward of a step",

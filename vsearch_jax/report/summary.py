@@ -54,7 +54,7 @@ def summarize_results(arrays: Mapping[str, Outcome], config: Config, wall_second
         "reachable": config.env.reachable,
         "motion": config.env.motion,
         "thesis": THESIS,
-        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "versions": versions(),
         "machine": {
             "platform": platform.platform(),
             "python": platform.python_version(),
@@ -63,6 +63,11 @@ def summarize_results(arrays: Mapping[str, Outcome], config: Config, wall_second
         },
         "wall_seconds": dict(wall_seconds),
     }
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions of the packages on which results depend, by name."""
+    return {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
 def _summarize_policies(trials: Trials, config: Config) -> Results:

@@ -26,7 +26,10 @@ _DROPPED = {UNVERSIONED: ("replay.data.truncated",)}
 _LATER_FIELDS: dict[str, dict[str, object]] = {
     "scene": {"symmetry": None},
     "encoder": {"loss": "autoencoder", "threshold_angle_deg": 3.0, "wide_weight": 0.3},
+    "env": {"target": "random"},
     "random_search": {"num_wide": 0},
+    "cma_es": {"constraint": "bounds"},
+    "sac": {"algorithm": "twin_q", "pool_fraction": 0.0},
 }
 """Fields of the config that came after version 0.2.0, with the values that mean what earlier versions did."""
 

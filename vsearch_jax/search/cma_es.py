@@ -37,7 +37,7 @@ from vsearch_jax.search.common import (
 from vsearch_jax.types import SearchResult, View
 
 AZIMUTH_UNIT = math.pi / 2.0
-"""One unit of the search space is 90 degrees of azimuth, or half the height of the band."""
+"""One unit of the search space: 90 degrees of azimuth. In elevation it is half the height of the band."""
 # Above the fitness of reachable views. 1 - cosine is at most 2; the rest leaves room for the bound penalty.
 _UNREACHABLE_FITNESS = 5.0
 # Fitness for each squared unit outside the band.
@@ -45,10 +45,18 @@ _BOUND_PENALTY = 1.0
 
 
 class Algorithm(NamedTuple):
-    """evosax's CMA-ES and its parameters."""
+    """evosax's CMA-ES, its parameters, and the search space.
+
+    Attributes:
+      cma_es: the strategy.
+      params: its parameters.
+      has_bounds: whether samples stay inside the band. Then the second unit of the search space is half its height.
+        Else it is 90 degrees of elevation.
+    """
 
     cma_es: CMA_ES
     params: CMAESParams
+    has_bounds: bool
 
 
 @flax.struct.dataclass
@@ -59,11 +67,13 @@ class CMAESState:
       record: what the search has found.
       strategy: evosax's state: mean, sigma, covariance and evolution paths.
       population: f32[N, 2], points of the last generation.
+      unreachable: i32[G], number of samples of each generation that the arm cannot reach.
     """
 
     record: Record
     strategy: Strategy
     population: Array
+    unreachable: Array
 
 
 def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: CMAESConfig) -> SearchResult:
@@ -73,6 +83,9 @@ def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: 
     strategy adapts. The fitness of a sample is 1 - cosine; lower is better. Azimuth is periodic and has no bounds. A
     sample outside the band (the elevations to search) is moved to the band's nearer end. The sample's squared distance
     to the band is added to the fitness (Hansen's boundary handling with a fixed weight).
+
+    With `config.constraint` "penalty" (thesis 5.4) there is no band. Samples may be anywhere. The fitness of a sample
+    that the arm cannot reach is 5, worse than that of any view.
 
     The search ends at the threshold or after `config.max_generations`. If the initial view meets the threshold, the
     search takes one image only.
@@ -101,6 +114,7 @@ def method(config: CMAESConfig) -> Method[CMAESState]:
         tell=functools.partial(update_state, algorithm),
         record=lambda state: state.record,
         num_views=config.population,
+        counts=lambda state: {"unreachable_by_generation": state.unreachable},
     )
 
 
@@ -110,7 +124,7 @@ def build_algorithm(config: CMAESConfig) -> Algorithm:
     cma_es = CMA_ES(population_size=config.population, solution=jnp.zeros(2))
     with evosax_promotion():
         params = dataclasses.replace(cma_es.default_params, std_init=jnp.asarray(sigma, jnp.float32))
-    return Algorithm(cma_es, params)
+    return Algorithm(cma_es, params, config.constraint == "bounds")
 
 
 def init_state(algorithm: Algorithm, config: CMAESConfig, args: SearchArgs[object], score: Array) -> CMAESState:
@@ -124,20 +138,22 @@ def init_state(algorithm: Algorithm, config: CMAESConfig, args: SearchArgs[objec
     """
     return CMAESState(
         record=start_record(args.initial, score, config.max_generations),
-        strategy=init_strategy(algorithm, to_point(args.initial, args.band)),
+        strategy=init_strategy(algorithm, _to_point(algorithm, args.initial, args.band)),
         population=jnp.zeros((config.population, 2)),
+        unreachable=jnp.zeros(config.max_generations, jnp.int32),
     )
 
 
-def fitness_of(population: Array, scores: Array, band: Array) -> Array:
+def fitness_of(algorithm: Algorithm, population: Array, scores: Array, band: Array) -> Array:
     """Computes the fitness f32[N] of N points: 1 - score, plus the squared distance to the band.
 
     Args:
+      algorithm: from `build_algorithm`.
       population: f32[N, 2], points in units of the search space.
       scores: f32[N], scores of the points' views; -inf where the arm cannot reach a view, whose fitness is 5.
       band: f32[2] rad, lowest and highest elevation of the search.
     """
-    _, excess = jax.vmap(to_view, in_axes=(0, None))(population, band)
+    _, excess = _to_views(algorithm, population, band)
     return jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2
 
 
@@ -155,7 +171,7 @@ def sample_views(algorithm: Algorithm, key: Array, band: Array, state: CMAESStat
     """
     with evosax_promotion():
         population, strategy = algorithm.cma_es.ask(key, state.strategy, algorithm.params)
-    views, _ = jax.vmap(to_view, in_axes=(0, None))(population, band)
+    views, _ = _to_views(algorithm, population, band)
     return views, dataclasses.replace(state, strategy=strategy, population=population)
 
 
@@ -172,11 +188,13 @@ def update_state(
       views: the observed views, View of f32[N] rad.
       scores: f32[N], scores of the views; -inf where the arm cannot reach a view.
     """
-    fitness = fitness_of(state.population, scores, args.band)
+    fitness = fitness_of(algorithm, state.population, scores, args.band)
     with evosax_promotion():
         strategy, _ = algorithm.cma_es.tell(key, state.population, fitness, state.strategy, algorithm.params)
     record = add_generation(state.record, views, scores, args.threshold)
-    return dataclasses.replace(state, record=record, strategy=strategy)
+    count = jnp.sum(jnp.isneginf(scores), dtype=jnp.int32)
+    unreachable = state.unreachable.at[state.record.generation].set(count)
+    return dataclasses.replace(state, record=record, strategy=strategy, unreachable=unreachable)
 
 
 @contextlib.contextmanager
@@ -199,30 +217,31 @@ def init_strategy(algorithm: Algorithm, mean: Array) -> Strategy:
     return dataclasses.replace(strategy, generation_counter=jnp.int32(-1))
 
 
-def to_point(view: View, band: Array) -> Array:
-    """Converts a view to its point of the search space, f32[2] in units of that space.
-
-    Args:
-      view: the view, f32[] rad.
-      band: f32[2] rad, lowest and highest elevation of the search.
-    """
+def _to_point(algorithm: Algorithm, view: View, band: Array) -> Array:
+    """Returns the point of the search space f32[2] of a view; `band` is f32[2] rad, lowest and highest elevation."""
+    if not algorithm.has_bounds:
+        return jnp.stack([view.azimuth, view.elevation]) / AZIMUTH_UNIT
     middle, half = jnp.mean(band), _half_height(band)
     return jnp.stack([view.azimuth / AZIMUTH_UNIT, (view.elevation - middle) / half])
 
 
-def to_view(point: Array, band: Array) -> tuple[View, Array]:
-    """Converts a point of the search space to the nearest view inside the band.
+def _to_views(algorithm: Algorithm, points: Array, band: Array) -> tuple[View, Array]:
+    """Converts points of the search space to views. With bounds each becomes the nearest view inside the band.
 
     Args:
-      point: f32[2], in units of the search space.
+      algorithm: from `build_algorithm`.
+      points: f32[N, 2], in units of the search space.
       band: f32[2] rad, lowest and highest elevation of the search.
 
     Returns:
-      The view; and the distance f32[] in units from the point to the band, negative below the band.
+      Views of f32[N] rad; and the distances f32[N] in units from the points to the band, negative below the band.
     """
-    inside = jnp.clip(point[1], -1.0, 1.0)
+    azimuth = wrap_angle(points[:, 0] * AZIMUTH_UNIT)
+    if not algorithm.has_bounds:
+        return View(azimuth, points[:, 1] * AZIMUTH_UNIT), jnp.zeros(points.shape[0])
+    inside = jnp.clip(points[:, 1], -1.0, 1.0)
     elevation = jnp.clip(jnp.mean(band) + inside * _half_height(band), band[0], band[1])
-    return View(azimuth=wrap_angle(point[0] * AZIMUTH_UNIT), elevation=elevation), point[1] - inside
+    return View(azimuth, elevation), points[:, 1] - inside
 
 
 def _half_height(band: Array) -> Array:

@@ -71,7 +71,10 @@ def method(config: CMAESConfig) -> Method[_State]:
         tell=functools.partial(_update_state, algorithm),
         record=lambda state: state.base.record,
         num_views=config.population,
-        counts=lambda state: {"num_restarts": state.num_restarts},
+        counts=lambda state: {
+            "num_restarts": state.num_restarts,
+            "unreachable_by_generation": state.base.unreachable,
+        },
     )
 
 
@@ -98,7 +101,7 @@ def _update_state(
     """Returns the state after the strategy's update and the restart rules of `search`."""
     sample_key, restart_key = _generation_keys(key, state)
     base = cma_es.update_state(algorithm, sample_key, args, state.base, views, scores)
-    strategy, best = base.strategy, cma_es.fitness_of(base.population, scores, args.band).min()
+    strategy, best = base.strategy, cma_es.fitness_of(algorithm, base.population, scores, args.band).min()
     stalled = jnp.where(best < state.run_fitness - _MIN_IMPROVEMENT, 0, state.stalled + 1)
     largest_std = strategy.std * jnp.sqrt(jnp.linalg.eigvalsh(strategy.C)[-1])
     is_over = (stalled >= _STALL_GENERATIONS) | (largest_std < _SMALLEST_STD)

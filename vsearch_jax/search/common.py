@@ -76,7 +76,7 @@ class Method(NamedTuple, Generic[SearchState]):
       tell: (key, args, state, views, scores f32[N]) -> state. `state` is the state that `ask` returned.
       record: state -> Record.
       num_views: number of views in a generation.
-      counts: state -> i32[] by name: how often the searcher did what the thesis's searcher does not, for example
+      counts: state -> the searcher's own counts by name, i32[] or i32[G] for G generations, for example
         `num_restarts`.
     """
 

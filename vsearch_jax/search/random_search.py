@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.config import RandomSearchConfig
-from vsearch_jax.geometry import fold_into_band, wrap_angle
+from vsearch_jax.geometry import fold_into_band, view_from_uniform, wrap_angle
 from vsearch_jax.search.common import (
     Method,
     Record,
@@ -22,6 +22,7 @@ from vsearch_jax.search.common import (
     start_record,
 )
 from vsearch_jax.types import SearchResult, View
+from vsearch_jax.xla.tree import tree_where
 
 
 @flax.struct.dataclass
@@ -84,14 +85,9 @@ def _sample_views(
     sigma = config.k * (1.0 - jnp.maximum(record.score, -1.0))  # an unreachable initial view has the score -inf
     azimuth = wrap_angle(record.view.azimuth + sigma * noise[0])
     elevation = fold_into_band(record.view.elevation + sigma * noise[1], args.band)
-    uniform = jax.random.uniform(wide_key, (2, config.num_samples))
-    low, high = args.band[0], args.band[1]
+    wide = view_from_uniform(jax.random.uniform(wide_key, (2, config.num_samples)), args.band)
     is_wide = jnp.arange(config.num_samples) >= config.num_samples - config.num_wide
-    views = View(
-        azimuth=jnp.where(is_wide, jnp.pi * (2.0 * uniform[0] - 1.0), azimuth),
-        elevation=jnp.where(is_wide, low + (high - low) * uniform[1], elevation),
-    )
-    return views, state
+    return tree_where(is_wide, wide, View(azimuth, elevation)), state
 
 
 def _update_state(

@@ -1,7 +1,9 @@
-"""Soft actor-critic with twin critics and an automatic temperature (Haarnoja et al. 2018, arXiv 1812.05905).
+"""Soft actor-critic with twin critics, in two forms; `SACConfig.algorithm` chooses.
 
-Two things differ from the paper: the critics have layer norm, and the step size falls to zero over the run. Both were
-measured on this task. The falling step size halves the policy's final error.
+`twin_q` has target critics and an automatic temperature (Haarnoja et al. 2018, arXiv 1812.05905). `value` has a state
+value network with a target network, and a fixed temperature (Haarnoja et al. 2018, arXiv 1801.01290; thesis, algorithm
+2). Two things differ from the papers: the critics have layer norm, and the step size falls to zero over the run. Both
+were measured on this task. The falling step size halves the policy's final error.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from flax import nnx
 from jax import Array
 
 from vsearch_jax.config import SACConfig
-from vsearch_jax.search.sac.networks import Actor, Critic, apply_network, init_network
+from vsearch_jax.search.sac.networks import Actor, Critic, Value, apply_network, init_network
 from vsearch_jax.types import SACState, Transition
 
 _ACTION_SIZE = 2
@@ -27,7 +29,7 @@ Params = TypeVar("Params", nnx.State, Array)
 def init(key: Array, config: SACConfig, observation_size: int, action_size: int = _ACTION_SIZE) -> SACState:
     """Creates the state of soft actor-critic before training: random networks and fresh optimizers.
 
-    The target critics equal the critics.
+    The target networks equal the networks.
 
     Args:
       key: PRNG key.
@@ -39,17 +41,22 @@ def init(key: Array, config: SACConfig, observation_size: int, action_size: int 
       Parameters and optimizer states before the first update.
     """
     actor_key, critic_key = jax.random.split(key)
+    value = None
+    if config.algorithm == "value":
+        value = init_network(jax.random.fold_in(critic_key, 2), Value, (observation_size, *config.hidden_sizes, 1))
     actor = init_network(actor_key, Actor, (observation_size, *config.hidden_sizes, 2 * action_size))
     sizes = (observation_size + action_size, *config.hidden_sizes, 1)
     critic = jax.vmap(lambda key: init_network(key, Critic, sizes))(jax.random.split(critic_key, 2))
     log_alpha = jnp.log(jnp.asarray(config.initial_temperature, jnp.float32))
+    moved, third = (critic, log_alpha) if value is None else (value, value)
     optimizer = _optimizer(config)
     return SACState(
         actor=actor,
         critic=critic,
-        target_critic=jax.tree.map(jnp.copy, critic),  # shared buffers would forbid the donation of the state
+        target_critic=jax.tree.map(jnp.copy, moved),  # shared buffers would forbid the donation of the state
         log_alpha=log_alpha,
-        opt_states=(optimizer.init(actor), optimizer.init(critic), optimizer.init(log_alpha)),
+        value=value,
+        opt_states=(optimizer.init(actor), optimizer.init(critic), optimizer.init(third)),
     )
 
 
@@ -76,9 +83,9 @@ def act(key: Array | None, actor: nnx.State, obs: Array, config: SACConfig, acti
 def update(
     key: Array, state: SACState, transitions: Transition, config: SACConfig
 ) -> tuple[SACState, dict[str, Array]]:
-    """Trains the policy by one gradient step of critics, actor and temperature, then updates the target critics.
+    """Trains the policy by one gradient step of all networks, then updates the target networks.
 
-    All three gradients are computed at the parameters of `state`.
+    All gradients are computed at the parameters of `state`.
 
     Args:
       key: PRNG key.
@@ -87,42 +94,50 @@ def update(
       config: settings of soft actor-critic.
 
     Returns:
-      Parameters and optimizer states after the step, and metrics f32[]: `critic_loss`, `actor_loss`, `alpha` (the
-      temperature before the step), `entropy` in nats.
+      Parameters and optimizer states after the step, and metrics f32[]: `critic_loss`, `value_loss` (NaN for
+      `twin_q`), `actor_loss`, `alpha` (the temperature before the step), `entropy` in nats.
     """
     target_key, actor_key = jax.random.split(key)
     target = td_target(target_key, state, transitions, config)
     critic_loss, critic_grads = jax.value_and_grad(_critic_loss)(state.critic, transitions, target, config)
     actor_grad = jax.value_and_grad(_actor_loss, has_aux=True)
     (actor_loss, entropy), actor_grads = actor_grad(state.actor, actor_key, state, transitions, config)
-    alpha = jnp.exp(state.log_alpha)
-    # Derivative of alpha (entropy - target entropy) with respect to log_alpha: arXiv 1812.05905, equation 18.
-    alpha_grad = alpha * (entropy - config.target_entropy * transitions.action.shape[-1])
 
     actor, actor_opt = _apply_gradients(state.actor, actor_grads, state.opt_states[0], config)
     critic, critic_opt = _apply_gradients(state.critic, critic_grads, state.opt_states[1], config)
-    log_alpha, alpha_opt = _apply_gradients(state.log_alpha, alpha_grad, state.opt_states[2], config)
-    target_critic = optax.incremental_update(critic, state.target_critic, config.tau)
+    log_alpha, value, source, value_loss = state.log_alpha, state.value, critic, jnp.full((), jnp.nan)
+    if value is None:
+        # Derivative of alpha (entropy - target entropy) with respect to log_alpha: arXiv 1812.05905, equation 18.
+        alpha_grad = jnp.exp(log_alpha) * (entropy - config.target_entropy * transitions.action.shape[-1])
+        log_alpha, third_opt = _apply_gradients(log_alpha, alpha_grad, state.opt_states[2], config)
+    else:
+        value_loss, value_grads = jax.value_and_grad(_value_loss)(value, actor_key, state, transitions, config)
+        source, third_opt = _apply_gradients(value, value_grads, state.opt_states[2], config)
+        value = source
+    moved = optax.incremental_update(source, state.target_critic, config.tau)
     new_state = SACState(
         actor=actor,
         critic=critic,
-        target_critic=cast(nnx.State, target_critic),  # optax returns the input's type, but declares any pytree
+        target_critic=cast(nnx.State, moved),  # optax returns the input's type, but declares any pytree
         log_alpha=log_alpha,
-        opt_states=(actor_opt, critic_opt, alpha_opt),
+        value=value,
+        opt_states=(actor_opt, critic_opt, third_opt),
     )
-    metrics = {"critic_loss": critic_loss, "actor_loss": actor_loss, "alpha": alpha, "entropy": entropy}
-    return new_state, metrics
+    alpha = jnp.exp(state.log_alpha)
+    losses = {"critic_loss": critic_loss, "value_loss": value_loss, "actor_loss": actor_loss}
+    return new_state, losses | {"alpha": alpha, "entropy": entropy}
 
 
 def td_target(key: Array, state: SACState, transitions: Transition, config: SACConfig) -> Array:
-    """Computes the values that the critics must learn: r + discount (min_i Q_i(s', a') - alpha log pi(a'|s')).
+    """Computes the values that the critics must learn: r + discount V(s').
 
-    After a terminated step the future value is 0. After a truncated step the future value counts, because such a step
-    has `terminated` = 0.
+    For `twin_q`, V(s') is min_i Q_i(s', a') - alpha log pi(a'|s') with the target critics Q_i and one random action a'.
+    For `value`, V is the target value network. After a terminated step the future value is 0. After a truncated step
+    the future value counts, because such a step has `terminated` = 0.
 
     Args:
       key: PRNG key of the next actions a'.
-      state: parameters. The target critics give Q_i, the actor gives pi.
+      state: parameters of target network and actor.
       transitions: a batch of B episode steps; the batch axis leads.
       config: settings of soft actor-critic; the discount is read.
 
@@ -130,9 +145,12 @@ def td_target(key: Array, state: SACState, transitions: Transition, config: SACC
       Target value of each step, f32[B].
     """
     obs = transitions.next_obs
-    action, log_prob = _sample_action(key, state.actor, obs, config, transitions.action.shape[-1])
-    value = _twin_values(state.target_critic, obs, action, config).min(axis=0)
-    soft_value = value - jnp.exp(state.log_alpha) * log_prob
+    if state.value is None:
+        action, log_prob = _sample_action(key, state.actor, obs, config, transitions.action.shape[-1])
+        value = _twin_values(state.target_critic, obs, action, config).min(axis=0)
+        soft_value = value - jnp.exp(state.log_alpha) * log_prob
+    else:
+        soft_value = _state_value(state.target_critic, obs, config)
     return transitions.reward + config.discount * (1.0 - transitions.terminated) * soft_value
 
 
@@ -148,6 +166,14 @@ def _actor_loss(
     action, log_prob = _sample_action(key, actor, transitions.obs, config, transitions.action.shape[-1])
     value = _twin_values(state.critic, transitions.obs, action, config).min(axis=0)
     return jnp.mean(jnp.exp(state.log_alpha) * log_prob - value), -jnp.mean(log_prob)
+
+
+def _value_loss(value: nnx.State, key: Array, state: SACState, transitions: Transition, config: SACConfig) -> Array:
+    """Returns the loss of the state value network (arXiv 1801.01290, equation 5; thesis 4.22)."""
+    action, log_prob = _sample_action(key, state.actor, transitions.obs, config, transitions.action.shape[-1])
+    wanted = _twin_values(state.critic, transitions.obs, action, config).min(axis=0)
+    wanted = jax.lax.stop_gradient(wanted - jnp.exp(state.log_alpha) * log_prob)
+    return 0.5 * jnp.mean((_state_value(value, transitions.obs, config) - wanted) ** 2)
 
 
 def _sample_action(
@@ -171,6 +197,11 @@ def _twin_values(critic: nnx.State, obs: Array, action: Array, config: SACConfig
     """Returns f32[2, ...], the values of both critics."""
     sizes = (obs.shape[-1] + action.shape[-1], *config.hidden_sizes, 1)
     return jax.vmap(lambda params: apply_network(Critic, sizes, params, obs, action))(critic)
+
+
+def _state_value(value: nnx.State, obs: Array, config: SACConfig) -> Array:
+    """Returns f32[...], the values of states."""
+    return apply_network(Value, (obs.shape[-1], *config.hidden_sizes, 1), value, obs)
 
 
 def _apply_gradients(

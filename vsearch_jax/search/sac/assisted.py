@@ -31,12 +31,17 @@ class Help:
     """What the local search did in an episode.
 
     Attributes:
-      num_helped: i32[], number of steps that the local search chose.
-      num_around: i32[], number of its steps around the present best view.
+      num_stalled: i32[], number of steps before which the policy had stalled. With help, the local search chose them.
+      num_around: i32[], number of the local search's steps around the present best view.
     """
 
-    num_helped: Array
+    num_stalled: Array
     num_around: Array
+
+
+def no_help() -> Help:
+    """Returns the Help of an episode before its first step."""
+    return Help(jnp.int32(0), jnp.int32(0))
 
 
 def search(
@@ -68,21 +73,35 @@ def search(
     Returns:
       The result, as of `policy.search`; and i32[], the number of steps that the local search chose.
     """
-    choose = functools.partial(_choose_action, key, args, config, jnp.asarray(is_assisted))
-    result, help_ = run_episode(step_fn, args, config, choose, Help(jnp.int32(0), jnp.int32(0)))
-    return result, help_.num_helped
+    choose = functools.partial(choose_action, key, args, config, jnp.asarray(is_assisted))
+    result, help_ = run_episode(step_fn, args, config, choose, no_help())
+    return result, jnp.where(is_assisted, help_.num_stalled, 0)
 
 
-def _choose_action(
+def choose_action(
     key: Array, args: SearchArgs[PolicyTask], config: Config, is_assisted: Array, progress: Progress, help_: Help
 ) -> tuple[Array, Help]:
+    """Chooses the action of the next step: the policy's, or the local search's where the policy has stalled.
+
+    Args:
+      key: PRNG key of the local search, equal in all steps of an episode.
+      args: the search problem, as of `search`.
+      config: the run's config, as of `search`.
+      is_assisted: bool[]; if false, the action is always the policy's.
+      progress: how far the episode is.
+      help_: what the local search did so far.
+
+    Returns:
+      Action f32[2], and what the local search did after the step.
+    """
     record, state = progress.record, progress.state
     num_steps = record.generation
     is_near = record.score >= _NEAR_SCORE
     # The first two steps count as progress, because there is no earlier score to compare with.
     has_improved = (num_steps < 2) | (record.score > record.best_scores[num_steps - 2] + _MIN_IMPROVEMENT)
-    is_helped = ~has_improved & ((num_steps >= config.evaluation.patience) | is_near)
-    is_helped = is_assisted & (is_helped | (state.info["is_reachable"] < 0.5))
+    is_stalled = ~has_improved & ((num_steps >= config.evaluation.patience) | is_near)
+    is_stalled = is_stalled | (state.info["is_reachable"] < 0.5)
+    is_helped = is_assisted & is_stalled
     num_around = jnp.where(has_improved, 0, help_.num_around)
 
     # The keys are equal in every step, so that the first angle and the sweep's direction stay.
@@ -92,7 +111,7 @@ def _choose_action(
     towards = _action_towards(tree_where(is_near, around, sweep), state, config)
     action = jnp.where(is_helped, towards, mean_action(args.task.actor, state, config))
     return action, Help(
-        num_helped=help_.num_helped + is_helped.astype(jnp.int32),
+        num_stalled=help_.num_stalled + is_stalled.astype(jnp.int32),
         num_around=num_around + (is_helped & is_near).astype(jnp.int32),
     )
 

@@ -63,15 +63,32 @@ class Critic(nnx.Module):
         return last_layer(hidden)[..., 0]
 
 
-Network: TypeAlias = Actor | Critic
+class Value(nnx.Module):
+    """Maps an obs to the value of the state. Layer norm precedes each activation, as in the critic."""
+
+    def __init__(self, sizes: tuple[int, ...], rngs: nnx.Rngs) -> None:
+        """Creates random layers.
+
+        Args:
+          sizes: number of units of each layer, from the input to the output.
+          rngs: random streams of flax.
+        """
+        self.critic = Critic(sizes, rngs)
+
+    def __call__(self, obs: Array) -> Array:
+        """Returns the values f32[...] of the states with the given obs, f32[..., D]."""
+        return self.critic(obs, obs[..., :0])
+
+
+Network: TypeAlias = Actor | Critic | Value
 
 
 def init_network(key: Array, network: type[Network], sizes: tuple[int, ...]) -> nnx.State:
-    """Creates random parameters of a policy network (Actor) or value network (Critic).
+    """Creates random parameters of a policy network (Actor), critic or state value network (Value).
 
     Args:
       key: PRNG key.
-      network: Actor or Critic.
+      network: Actor, Critic or Value.
       sizes: number of units of each layer, from the input to the output.
 
     Returns:
@@ -81,16 +98,16 @@ def init_network(key: Array, network: type[Network], sizes: tuple[int, ...]) -> 
 
 
 def apply_network(network: type[Network], sizes: tuple[int, ...], params: nnx.State, *inputs: Array) -> Array:
-    """Computes the output of a policy network (Actor) or value network (Critic) for given inputs.
+    """Computes the output of a policy network (Actor), critic or state value network (Value) for given inputs.
 
     Args:
-      network: Actor or Critic.
+      network: Actor, Critic or Value.
       sizes: numbers of units: of the whole input, of each hidden layer, of the output.
       params: parameters from `init_network` with the same `network` and `sizes`.
-      *inputs: the obs f32[..., O] for an Actor; the obs and the action f32[..., A] for a Critic.
+      *inputs: the obs f32[..., O]; for a Critic also the action f32[..., A].
 
     Returns:
-      An Actor's distribution parameters f32[..., sizes[-1]], or a Critic's values f32[...] (its last size is 1).
+      An Actor's distribution parameters f32[..., sizes[-1]], or values f32[...] (the last size is 1).
     """
     return nnx.merge(_graphdef(network, sizes), params)(*inputs)
 

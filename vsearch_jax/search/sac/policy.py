@@ -113,22 +113,47 @@ def run_episode(
     Returns:
       The result, as of `search`, and what `choose` last returned as its memory.
     """
+    body = functools.partial(run_step, step_fn, args, choose)
+    progress, memory = jax.lax.while_loop(
+        lambda loop: is_running(loop[0].record, args.threshold), body, (start_progress(args, config), memory)
+    )
+    return episode_result(progress), memory
+
+
+def start_progress(args: SearchArgs[PolicyTask], config: Config) -> Progress:
+    """Returns the progress of an episode before its first step.
+
+    Args:
+      args: the search problem, as of `search`.
+      config: the run's config; the length of the episode is read.
+    """
     record = start_record(args.initial, jnp.asarray(-jnp.inf, jnp.float32), config.env.episode_length)
     record = dataclasses.replace(record, evaluations=jnp.int32(0), unreachable=jnp.int32(0))
-    progress = Progress(record=record, state=args.task.start, costs=jnp.zeros(2))
-    body = functools.partial(_run_step, step_fn, args, choose)
-    progress, memory = jax.lax.while_loop(
-        lambda loop: is_running(loop[0].record, args.threshold), body, (progress, memory)
-    )
+    return Progress(record=record, state=args.task.start, costs=jnp.zeros(2))
+
+
+def episode_result(progress: Progress) -> SearchResult:
+    """Returns the result of an episode, as of `search`, from its progress at the end."""
     state = progress.state
     result = to_result(progress.record)
     score, end = state.metrics["similarity"], PolicyEnd(state, *progress.costs)
-    return dataclasses.replace(result, view=present_view(state), score=score, end=end), memory
+    return dataclasses.replace(result, view=present_view(state), score=score, end=end)
 
 
-def _run_step(
+def run_step(
     step_fn: StepFn, args: SearchArgs[PolicyTask], choose: ChooseAction[Memory], loop: tuple[Progress, Memory]
 ) -> tuple[Progress, Memory]:
+    """Runs one step of an episode that has not ended.
+
+    Args:
+      step_fn: the environment's `step`.
+      args: the search problem, as of `search`.
+      choose: chooses the action.
+      loop: the progress, and the memory of `choose`.
+
+    Returns:
+      The progress after the step, and what `choose` returned as its memory.
+    """
     progress, memory = loop
     action, memory = choose(progress, memory)
     state = step_fn(progress.state, action)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.types import ReplayState, Transition
+from vsearch_jax.xla.tree import tree_zeros
 
 
 def init_replay(example: Transition, capacity: int) -> ReplayState:
@@ -23,8 +24,7 @@ def init_replay(example: Transition, capacity: int) -> ReplayState:
     Returns:
       The buffer, without transitions.
     """
-    data = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), example)
-    return ReplayState(data=data, num_inserted=jnp.zeros((), jnp.int32))
+    return ReplayState(data=tree_zeros(example, (capacity,)), num_inserted=jnp.zeros((), jnp.int32))
 
 
 def insert(replay: ReplayState, transitions: Transition) -> ReplayState:

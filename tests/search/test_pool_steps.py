@@ -1,0 +1,72 @@
+"""Tests of the steps between views of the pool."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsearch_jax as vs
+from vsearch_jax.search import sac
+from vsearch_jax.types import Camera, Observation, View
+
+CONFIG = vs.Config.preset("smoke").env
+BAND = np.deg2rad([40.0, 70.0]).astype(np.float32)
+NUM_VIEWS, NUM_STEPS = 400, 300
+
+
+def make_pool() -> tuple[Observation, np.ndarray]:
+    """Returns a pool whose codes and joints tell the view's index, and the views f32[P, 2] in degrees."""
+    rng = np.random.default_rng(0)
+    degrees = np.stack([rng.uniform(-180.0, 180.0, NUM_VIEWS), rng.uniform(40.0, 70.0, NUM_VIEWS)], axis=-1)
+    azimuth, elevation = np.deg2rad(degrees.T).astype(np.float32)
+    code = rng.normal(size=(NUM_VIEWS, 16)).astype(np.float32)
+    qpos = np.arange(NUM_VIEWS, dtype=np.float32)[:, None]
+    zeros = jnp.zeros((NUM_VIEWS, 3))
+    camera = Camera(zeros, jnp.zeros((NUM_VIEWS, 3, 3)), jnp.zeros(NUM_VIEWS))
+    return Observation(View(jnp.asarray(azimuth), jnp.asarray(elevation)), qpos, camera, jnp.asarray(code)), degrees
+
+
+@pytest.fixture(scope="module")
+def steps():
+    pool, degrees = make_pool()
+    indexed = sac.index_pool(pool, jnp.asarray(BAND))
+    made = sac.sample_pool_steps(jax.random.key(3), indexed, NUM_STEPS, CONFIG)
+    return jax.tree.map(np.asarray, made), np.asarray(pool.code), degrees
+
+
+def test_the_action_leads_from_the_first_view_to_the_second(steps):
+    made, code, degrees = steps
+    start, end = made.obs[:, -1].astype(int), made.next_obs[:, -1].astype(int)
+    np.testing.assert_array_equal(made.obs[:, :16], code[start])
+    np.testing.assert_array_equal(made.next_obs[:, :16], code[end])
+    change = degrees[end] - degrees[start]
+    change[:, 0] = (change[:, 0] + 180.0) % 360.0 - 180.0
+    wanted = np.clip(change / CONFIG.action_scale_deg, -1.0, 1.0)
+    np.testing.assert_allclose(made.action, wanted, atol=1e-4)
+    # The pool is sparse, so the nearest view can be some degrees beyond the longest step.
+    assert (np.abs(change) <= CONFIG.action_scale_deg + 8.0).all()
+    assert np.abs(made.action).mean() == pytest.approx(0.5, abs=0.1)
+
+
+def test_rewards_are_those_of_the_task(steps):
+    made, _, _ = steps
+    code, target = made.next_obs[:, :16], made.obs[:, 16:32]
+    np.testing.assert_array_equal(target, made.next_obs[:, 16:32])
+    cosine = (code * target).sum(-1) / np.linalg.norm(code, axis=-1) / np.linalg.norm(target, axis=-1)
+    is_found = cosine >= CONFIG.threshold
+    np.testing.assert_array_equal(made.terminated, is_found)
+    np.testing.assert_allclose(made.reward, np.where(is_found, CONFIG.success_reward, cosine - 1.0), atol=1e-5)
+    assert made.is_reachable.all()
+
+
+def test_a_third_of_the_targets_is_the_end_of_the_step_and_a_third_is_near_it(steps):
+    made, code, degrees = steps
+    end = made.next_obs[:, -1].astype(int)
+    target = np.argmin(np.linalg.norm(code[None] - made.obs[:, None, 16:32], axis=-1), axis=-1)
+    offset = degrees[target] - degrees[end]
+    offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
+    distance = np.linalg.norm(offset, axis=-1)
+    assert (target == end).mean() == pytest.approx(1 / 3, abs=0.15)  # a near target can be the end too
+    assert (distance < 20.0).mean() == pytest.approx(0.7, abs=0.1)
