@@ -15,6 +15,7 @@ import vsearch_jax as vs
 from vsearch_jax.runs import checkpoint
 from vsearch_jax.runs.old_versions import current_names
 from vsearch_jax.training import run as training
+from vsearch_jax.training import with_encoder
 
 # Silhouettes need no light, which takes half of the renderer's compile time.
 SMOKE = vs.Config.preset("smoke")
@@ -90,6 +91,21 @@ def test_encoder_changes_in_its_stage_and_stays_in_the_policy_stage():
             after = arrays(state.encoder)
             assert all((before[path] == after[path]).all() for path in before)
     assert num_policy_chunks > 0
+
+
+def test_policies_start_with_the_encoder_of_another_run_and_a_fixed_target(chunked):
+    other = chunked[0].encoder
+    config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, target="fixed"))
+    state = with_encoder(vs.init(jax.random.key(1), config), other, config)
+    assert int(state.step) == config.encoder.num_updates
+    for path, leaf in arrays(other).items():
+        np.testing.assert_array_equal(arrays(state.encoder)[path], leaf, err_msg=path)
+    view = state.env.pipeline_state.target.view
+    wanted = np.deg2rad([config.evaluation.target_azimuth_deg, config.evaluation.target_elevation_deg])
+    for angles, angle in ((view.azimuth, wanted[0]), (view.elevation, wanted[1])):
+        np.testing.assert_allclose(angles, np.full((1, config.sac.num_envs), angle), atol=1e-5)
+    azimuths = np.asarray(state.env.pipeline_state.observation.view.azimuth)
+    assert np.unique(azimuths).size > 1  # the initial views stay random
 
 
 def test_state_is_finite_after_the_run(chunked):

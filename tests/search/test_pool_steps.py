@@ -9,7 +9,7 @@ import pytest
 
 import vsearch_jax as vs
 from vsearch_jax.search import sac
-from vsearch_jax.types import Camera, Observation, View
+from vsearch_jax.types import Camera, Observation, ReachabilityMap, View
 
 CONFIG = vs.Config.preset("smoke").env
 BAND = np.deg2rad([40.0, 70.0]).astype(np.float32)
@@ -28,10 +28,18 @@ def make_pool() -> tuple[Observation, np.ndarray]:
     return Observation(View(jnp.asarray(azimuth), jnp.asarray(elevation)), qpos, camera, jnp.asarray(code)), degrees
 
 
+def make_map() -> ReachabilityMap:
+    """Returns a map of elevations from 20 to 90 degrees, of which 40 to 70 are reachable."""
+    azimuths, elevations = np.arange(0.0, 360.0, 10.0), np.arange(20.0, 91.0, 5.0)
+    is_reachable = np.broadcast_to((elevations >= 40.0) & (elevations <= 70.0), (len(azimuths), len(elevations)))
+    axes = (jnp.asarray(np.deg2rad(axis), jnp.float32) for axis in (azimuths, elevations))
+    return ReachabilityMap(*axes, jnp.asarray(is_reachable), jnp.zeros((*is_reachable.shape, 1)), jnp.asarray(BAND))
+
+
 @pytest.fixture(scope="module")
 def steps():
     pool, degrees = make_pool()
-    indexed = sac.index_pool(pool, jnp.asarray(BAND))
+    indexed = sac.index_pool(pool, make_map())
     made = sac.sample_pool_steps(jax.random.key(3), indexed, NUM_STEPS, CONFIG)
     return jax.tree.map(np.asarray, made), np.asarray(pool.code), degrees
 
@@ -41,13 +49,26 @@ def test_the_action_leads_from_the_first_view_to_the_second(steps):
     start, end = made.obs[:, -1].astype(int), made.next_obs[:, -1].astype(int)
     np.testing.assert_array_equal(made.obs[:, :16], code[start])
     np.testing.assert_array_equal(made.next_obs[:, :16], code[end])
+    is_reachable = made.is_reachable > 0.5
+    np.testing.assert_array_equal(start[~is_reachable], end[~is_reachable])
+    start, end, action = start[is_reachable], end[is_reachable], made.action[is_reachable]
     change = degrees[end] - degrees[start]
     change[:, 0] = (change[:, 0] + 180.0) % 360.0 - 180.0
     wanted = np.clip(change / CONFIG.action_scale_deg, -1.0, 1.0)
-    np.testing.assert_allclose(made.action, wanted, atol=1e-4)
+    np.testing.assert_allclose(action, wanted, atol=1e-4)
     # The pool is sparse, so the nearest view can be some degrees beyond the longest step.
     assert (np.abs(change) <= CONFIG.action_scale_deg + 8.0).all()
-    assert np.abs(made.action).mean() == pytest.approx(0.5, abs=0.1)
+    assert np.abs(action).mean() == pytest.approx(0.5, abs=0.1)
+
+
+def test_steps_beyond_what_the_arm_reaches_stay_and_cost_the_penalty(steps):
+    made, _, degrees = steps
+    stays = made.is_reachable < 0.5
+    assert 0.05 < stays.mean() < 0.33
+    elevation = degrees[made.obs[stays, -1].astype(int), 1] + CONFIG.action_scale_deg * made.action[stays, 1]
+    assert ((elevation < 40.0) | (elevation > 70.0)).all()
+    np.testing.assert_array_equal(made.reward[stays], CONFIG.unreachable_reward)
+    assert not made.terminated[stays].any()
 
 
 def test_rewards_are_those_of_the_task(steps):
@@ -55,10 +76,11 @@ def test_rewards_are_those_of_the_task(steps):
     code, target = made.next_obs[:, :16], made.obs[:, 16:32]
     np.testing.assert_array_equal(target, made.next_obs[:, 16:32])
     cosine = (code * target).sum(-1) / np.linalg.norm(code, axis=-1) / np.linalg.norm(target, axis=-1)
-    is_found = cosine >= CONFIG.threshold
-    np.testing.assert_array_equal(made.terminated, is_found)
-    np.testing.assert_allclose(made.reward, np.where(is_found, CONFIG.success_reward, cosine - 1.0), atol=1e-5)
-    assert made.is_reachable.all()
+    is_reachable = made.is_reachable > 0.5
+    is_found = cosine[is_reachable] >= CONFIG.threshold
+    np.testing.assert_array_equal(made.terminated[is_reachable], is_found)
+    reward = np.where(is_found, CONFIG.success_reward, cosine[is_reachable] - 1.0)
+    np.testing.assert_allclose(made.reward[is_reachable], reward, atol=1e-5)
 
 
 def test_a_third_of_the_targets_is_the_end_of_the_step_and_a_third_is_near_it(steps):

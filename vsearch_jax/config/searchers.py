@@ -16,7 +16,7 @@ class RandomSearchConfig:
     """Number of views in an epoch."""
     k: float = 1.5
     """Factor k. The standard deviation of the samples is k (1 - best cosine so far), in rad."""
-    num_wide: int = 1
+    num_wide: int = 2
     """Number of the views in an epoch that are uniform over the band instead. The thesis has none."""
     max_epochs: int = 30
     """Number of epochs after which the search gives up."""

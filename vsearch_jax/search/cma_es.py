@@ -138,7 +138,7 @@ def init_state(algorithm: Algorithm, config: CMAESConfig, args: SearchArgs[objec
     """
     return CMAESState(
         record=start_record(args.initial, score, config.max_generations),
-        strategy=init_strategy(algorithm, _to_point(algorithm, args.initial, args.band)),
+        strategy=init_strategy(algorithm, to_point(algorithm, args.initial, args.band)),
         population=jnp.zeros((config.population, 2)),
         unreachable=jnp.zeros(config.max_generations, jnp.int32),
     )
@@ -153,7 +153,7 @@ def fitness_of(algorithm: Algorithm, population: Array, scores: Array, band: Arr
       scores: f32[N], scores of the points' views; -inf where the arm cannot reach a view, whose fitness is 5.
       band: f32[2] rad, lowest and highest elevation of the search.
     """
-    _, excess = _to_views(algorithm, population, band)
+    _, excess = to_views(algorithm, population, band)
     return jnp.where(jnp.isneginf(scores), _UNREACHABLE_FITNESS, 1.0 - scores) + _BOUND_PENALTY * excess**2
 
 
@@ -171,7 +171,7 @@ def sample_views(algorithm: Algorithm, key: Array, band: Array, state: CMAESStat
     """
     with evosax_promotion():
         population, strategy = algorithm.cma_es.ask(key, state.strategy, algorithm.params)
-    views, _ = _to_views(algorithm, population, band)
+    views, _ = to_views(algorithm, population, band)
     return views, dataclasses.replace(state, strategy=strategy, population=population)
 
 
@@ -217,15 +217,21 @@ def init_strategy(algorithm: Algorithm, mean: Array) -> Strategy:
     return dataclasses.replace(strategy, generation_counter=jnp.int32(-1))
 
 
-def _to_point(algorithm: Algorithm, view: View, band: Array) -> Array:
-    """Returns the point of the search space f32[2] of a view; `band` is f32[2] rad, lowest and highest elevation."""
+def to_point(algorithm: Algorithm, view: View, band: Array) -> Array:
+    """Returns the point of the search space of a view, f32[2].
+
+    Args:
+      algorithm: from `build_algorithm`.
+      view: the view, f32[] rad.
+      band: f32[2] rad, lowest and highest elevation of the search.
+    """
     if not algorithm.has_bounds:
         return jnp.stack([view.azimuth, view.elevation]) / AZIMUTH_UNIT
     middle, half = jnp.mean(band), _half_height(band)
     return jnp.stack([view.azimuth / AZIMUTH_UNIT, (view.elevation - middle) / half])
 
 
-def _to_views(algorithm: Algorithm, points: Array, band: Array) -> tuple[View, Array]:
+def to_views(algorithm: Algorithm, points: Array, band: Array) -> tuple[View, Array]:
     """Converts points of the search space to views. With bounds each becomes the nearest view inside the band.
 
     Args:

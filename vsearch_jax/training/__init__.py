@@ -1,6 +1,6 @@
 """A whole run as one jitted function: encoder updates first, then policy iterations, in equal chunks."""
 
-from vsearch_jax.training.encoder_stage import encoder_iteration
+from vsearch_jax.training.encoder_stage import encoder_iteration, fill_pool
 from vsearch_jax.training.metrics import ENCODER_METRICS, ENCODER_STAGE, POLICY_METRICS, POLICY_STAGE, Metrics
 from vsearch_jax.training.run import init, train, with_encoder
 
@@ -11,6 +11,7 @@ __all__ = [
     "POLICY_STAGE",
     "Metrics",
     "encoder_iteration",
+    "fill_pool",
     "init",
     "train",
     "with_encoder",

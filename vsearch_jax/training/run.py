@@ -122,7 +122,7 @@ def _train(state: TrainState, config: Config) -> tuple[TrainState, Metrics]:
     state = jax.lax.fori_loop(0, is_encoder_done, functools.partial(_finish_encoder, config=config), state)
 
     env = ViewSearchEnv(config, state.encoder, state.reach)
-    pool = sac.index_pool(state.pool, state.reach.band)
+    pool = sac.index_pool(state.pool, state.reach)
     update_policy = functools.partial(policy_iteration, env=env, pool=pool, key=jax.random.fold_in(state.key, _POLICY))
     carry, metrics = jax.lax.fori_loop(
         encoder_stop,

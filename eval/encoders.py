@@ -1,0 +1,149 @@
+"""Compares the encoder's losses: `python eval/encoders.py --out DIR [--objects NAME ...] [--losses LOSS ...]`.
+
+Trains an encoder for each object, loss and seed, all for about equal time, and measures how well its codes tell views
+apart. Each result is kept in DIR at once, and the same command continues an interrupted one. DIR then holds
+encoders.json and encoders.md. `--quick` does all of it in small, as a test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import shlex
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before jax is imported
+
+import jax
+import numpy as np
+
+import vsearch_jax as vs
+from encoder_sections.images import FULL, QUICK, encode_views, train_encoder
+from encoder_sections.measures import measure
+from parts import PARTS, write_part
+from vsearch_jax import report, runs
+
+UPDATES = {"pose": 400, "autoencoder": 220, "both": 210}
+"""Updates of each loss. They take about equal time on the teapot; each row holds its seconds."""
+OBJECTS = ("teapot", "truck", "bracket", "part:plate", "part:bracket", "part:gear")
+SHOWN = {
+    "false_match_rate": ("matches > 10° off (%)", 100.0),
+    "targets_with_false_match_rate": ("targets with one (%)", 100.0),
+    "match_angle_deg_median": ("angle of matches, median (°)", 1.0),
+    "threshold_angle_deg_azimuth": ("angle at the threshold: azimuth (°)", 1.0),
+    "threshold_angle_deg_elevation": ("elevation (°)", 1.0),
+    "basin_share": ("basin (%)", 100.0),
+    "far_cosine_max_mean": ("best cosine > 20° off", 1.0),
+    "arm_cosine_change_percent": ("arm: cosine (%)", 1.0),
+    "arm_pose_change_deg": ("arm: pose (°)", 1.0),
+    "light_pose_change_deg": ("light (°)", 1.0),
+    "occlusion_pose_change_deg": ("occlusion (°)", 1.0),
+    "shift_pose_change_deg": ("camera shift (°)", 1.0),
+    "noise_pose_change_deg": ("noise (°)", 1.0),
+    "blur_pose_change_deg": ("blur (°)", 1.0),
+    "train_seconds": ("time (s)", 1.0),
+}
+
+
+def main(arguments: list[str]) -> None:
+    """Trains and measures what is not done yet, and writes the tables."""
+    parser = argparse.ArgumentParser(description="Compares the encoder's losses.")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the results; also of an interrupted command")
+    parser.add_argument(
+        "--objects", nargs="+", default=OBJECTS, help="names or files; part:NAME is one of eval/parts.py"
+    )
+    parser.add_argument("--losses", nargs="+", default=tuple(UPDATES), choices=tuple(UPDATES))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="small sizes, for a test")
+    options = parser.parse_args(arguments)
+    rows = options.out / "rows"
+    rows.mkdir(parents=True, exist_ok=True)
+    for name in options.objects:
+        for loss in options.losses:
+            for seed in range(options.seeds):
+                path = rows / f"{Path(name).stem.replace(':', '-')}-{loss}-{seed}.json"
+                if path.is_file():
+                    continue
+                row = {"object": name, "loss": loss, "seed": seed}
+                row |= measure_encoder(_config(name, loss, options.out, options.quick), seed, options.quick)
+                runs.write_atomically(path, json.dumps(row, indent=1) + "\n")
+                print(f"{name}, {loss}, seed {seed}: {row['train_seconds']:.0f} s", flush=True)
+    found = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(rows.glob("*.json"))]
+    command = shlex.join(["python", "eval/encoders.py", *arguments])
+    content = {"command": command, "versions": report.versions(), "rows": found}
+    runs.write_atomically(options.out / "encoders.json", json.dumps(content, indent=1) + "\n")
+    runs.write_atomically(options.out / "encoders.md", to_markdown(content))
+    print(f"wrote {options.out / 'encoders.md'}")
+
+
+def _config(name: str, loss: str, out: Path, is_quick: bool) -> vs.Config:
+    """Returns the config of one training; writes the part's file if the object is one of `eval/parts.py`."""
+    config = vs.Config.preset("smoke" if is_quick else "cpu")
+    scene = dataclasses.replace(config.scene, object=name)
+    if name.startswith("part:"):
+        part = name.removeprefix("part:")
+        if part not in PARTS:
+            raise SystemExit(
+                f"--objects {name}: no such part; allowed: {', '.join(f'part:{known}' for known in PARTS)}"
+            )
+        path = write_part(part, out / "parts")
+        scene = dataclasses.replace(config.scene, object=str(path), mesh_scale=0.001)
+    updates = config.encoder.num_updates if is_quick else UPDATES[loss]
+    encoder = dataclasses.replace(config.encoder, loss=loss, num_updates=updates)
+    return dataclasses.replace(config, scene=scene, encoder=encoder)
+
+
+def measure_encoder(config: vs.Config, seed: int, is_quick: bool) -> dict[str, float]:
+    """Trains one encoder, and returns its measures and the seconds of its training without compilation.
+
+    Args:
+      config: the run's config.
+      seed: seed of all random numbers.
+      is_quick: small sizes.
+    """
+    env = vs.ViewSearchEnv(config)
+    train_key, measure_key = jax.random.split(jax.random.key(seed))
+    compiled = train_encoder.lower(train_key, env.reach, config).compile()
+    began = time.perf_counter()
+    encoder = jax.block_until_ready(compiled(train_key, env.reach))
+    seconds = time.perf_counter() - began
+    codes = encode_views(measure_key, encoder, env.reach, config, QUICK if is_quick else FULL)
+    low, high = np.rad2deg(np.asarray(env.reach.band))
+    measured = measure(codes, float(high - low), env.scene.symmetry, config.env.threshold)
+    return measured | {"train_seconds": seconds, "num_updates": config.encoder.num_updates}
+
+
+def to_markdown(content: Mapping[str, Any]) -> str:
+    """Returns the tables: means over the seeds for each object and loss, then over all objects.
+
+    Args:
+      content: what `encoders.json` holds.
+    """
+    lines = ["# Losses of the encoder", "", f"Written by `{content['command']}`. Means over the seeds.", ""]
+    lines += [f"| object | loss | seeds | {' | '.join(label for label, _ in SHOWN.values())} |"]
+    lines += ["|---" * (len(SHOWN) + 3) + "|"]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in content["rows"]:
+        groups.setdefault((row["object"], row["loss"]), []).append(row)
+    for (name, loss), rows in groups.items():
+        lines.append(_line(name, loss, rows))
+    for loss in dict.fromkeys(loss for _, loss in groups):
+        lines.append(_line("**all**", loss, [row for row in content["rows"] if row["loss"] == loss]))
+    return "\n".join(lines) + "\n"
+
+
+def _line(name: str, loss: str, rows: Iterable[Mapping[str, Any]]) -> str:
+    rows = list(rows)
+    cells = [f"{scale * np.nanmean([row[key] for row in rows]):.3g}" for key, (_, scale) in SHOWN.items()]
+    seeds = len({row["seed"] for row in rows})
+    return f"| {name} | {loss} | {seeds} | {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
