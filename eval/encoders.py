@@ -2,7 +2,8 @@
 
 Trains an encoder for each object, loss and seed, all for about equal time, and measures how well its codes tell views
 apart. Each result is kept in DIR at once, and the same command continues an interrupted one. DIR then holds
-encoders.json and encoders.md. `--quick` does all of it in small, as a test.
+encoders.json and encoders.md. `--quick` does all of it in small, as a test. `--runs RUN ...` measures the encoders of
+finished runs instead.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from encoder_sections.images import FULL, QUICK, encode_views, train_encoder
 from encoder_sections.measures import measure
 from parts import PARTS, write_part
 from vsearch_jax import report, runs
+from vsearch_jax.types import EncoderState, ReachabilityMap
 
 UPDATES = {"pose": 400, "autoencoder": 220, "both": 210}
 """Updates of each loss. They take about equal time on the teapot; each row holds its seconds."""
@@ -60,11 +62,14 @@ def main(arguments: list[str]) -> None:
     )
     parser.add_argument("--losses", nargs="+", default=tuple(UPDATES), choices=tuple(UPDATES))
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--runs", nargs="+", type=Path, default=(), help="measure the encoders of these runs instead")
     parser.add_argument("--quick", action="store_true", help="small sizes, for a test")
     options = parser.parse_args(arguments)
     rows = options.out / "rows"
     rows.mkdir(parents=True, exist_ok=True)
-    for name in options.objects:
+    for run in options.runs:
+        _measure_run(run, rows / f"{run.name}.json", options.quick)
+    for name in () if options.runs else options.objects:
         for loss in options.losses:
             for seed in range(options.seeds):
                 path = rows / f"{Path(name).stem.replace(':', '-')}-{loss}-{seed}.json"
@@ -80,6 +85,22 @@ def main(arguments: list[str]) -> None:
     runs.write_atomically(options.out / "encoders.json", json.dumps(content, indent=1) + "\n")
     runs.write_atomically(options.out / "encoders.md", to_markdown(content))
     print(f"wrote {options.out / 'encoders.md'}")
+
+
+def _measure_run(run: Path, path: Path, is_quick: bool) -> None:
+    """Measures the encoder of a run, whose encoder stage is done, and keeps the result in the file `path`."""
+    if path.is_file():
+        return
+    config = runs.read_config(run)
+    state = runs.resume_run(run, config)
+    if int(state.step) < config.encoder.num_updates:
+        raise SystemExit(f"--runs {run}: its encoder is not trained yet; first: vsearch train --out {run} --resume")
+    lines = runs.read_metrics(run)
+    seconds = sum(line["seconds"] for line in lines if line["stage"] == "encoder")
+    row = {"object": Path(config.scene.object).stem, "loss": config.encoder.loss, "seed": runs.read_seed(run)}
+    row |= _measure(state.encoder, state.reach, config, runs.read_seed(run), is_quick)
+    row |= {"train_seconds": seconds, "num_updates": config.encoder.num_updates}
+    runs.write_atomically(path, json.dumps(row, indent=1) + "\n")
 
 
 def _config(name: str, loss: str, out: Path, is_quick: bool) -> vs.Config:
@@ -108,15 +129,24 @@ def measure_encoder(config: vs.Config, seed: int, is_quick: bool) -> dict[str, f
       is_quick: small sizes.
     """
     env = vs.ViewSearchEnv(config)
-    train_key, measure_key = jax.random.split(jax.random.key(seed))
+    train_key = jax.random.key(seed)
     compiled = train_encoder.lower(train_key, env.reach, config).compile()
     began = time.perf_counter()
     encoder = jax.block_until_ready(compiled(train_key, env.reach))
     seconds = time.perf_counter() - began
-    codes = encode_views(measure_key, encoder, env.reach, config, QUICK if is_quick else FULL)
-    low, high = np.rad2deg(np.asarray(env.reach.band))
-    measured = measure(codes, float(high - low), env.scene.symmetry, config.env.threshold)
+    measured = _measure(encoder, env.reach, config, seed, is_quick)
     return measured | {"train_seconds": seconds, "num_updates": config.encoder.num_updates}
+
+
+def _measure(
+    encoder: EncoderState, reach: ReachabilityMap, config: vs.Config, seed: int, is_quick: bool
+) -> dict[str, float]:
+    """Returns the measures of a trained encoder."""
+    key = jax.random.fold_in(jax.random.key(seed), 1)
+    codes = encode_views(key, encoder, reach, config, QUICK if is_quick else FULL)
+    low, high = np.rad2deg(np.asarray(reach.band))
+    symmetry = vs.build_scene(config.scene).symmetry
+    return measure(codes, float(high - low), symmetry, config.env.threshold)
 
 
 def to_markdown(content: Mapping[str, Any]) -> str:

@@ -3,11 +3,12 @@
 A visible face of a mesh covers only a few pixels. So it is cheaper to find the pixels of each face than to find the
 face of each ray. The algorithm has three steps:
 
-1. `_bounding_rectangles` projects the corners of every face, and returns the rectangle of pixels that holds the face.
-   Faces outside the image and culled faces get an empty rectangle.
-2. All pairs (face, pixel of its rectangle) are numbered; see `render.geometry.pairs`. A loop takes a batch of
-   consecutive numbers at a time, and recovers from each number the face (a scatter of the faces' first numbers, then a
-   running maximum) and the pixel (the pair's rank within its face).
+1. `_bounding_strips` projects the corners of every face, and returns a strip of pixels that holds the face. The strip
+   of a long, slanted face is narrow; CAD programs make many such faces. Faces outside the image and culled faces get an
+   empty strip.
+2. All pairs (face, pixel of its strip) are numbered; see `render.geometry.pairs`. A loop takes a batch of consecutive
+   numbers at a time, and recovers from each number the face (a scatter of the faces' first numbers, then a running
+   maximum) and the pixel (the pair's rank within its face).
 3. For each pair, the ray through the pixel's centre is tested against the face. The nearest hit of each pixel is kept
    (a depth buffer, by a scatter of minima).
 
@@ -28,7 +29,16 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.render.geometry.pairs import Pairs, count_pairs, faces_of_pairs, pixels_of_pairs
+from vsearch_jax.render.geometry.pairs import (
+    Pairs,
+    Strips,
+    count_pairs,
+    faces_of_pairs,
+    max_of_three,
+    min_of_three,
+    narrow_strips,
+    pixels_of_pairs,
+)
 from vsearch_jax.render.geometry.triangles import Triangles
 from vsearch_jax.xla.materialize import materialize
 from vsearch_jax.xla.vectors import Vector
@@ -96,15 +106,6 @@ def _take(table: Array, index: Array) -> Array:
     return table.at[index].get(mode="promise_in_bounds")
 
 
-# Elementwise, and not `jnp.min` of a stack: XLA on CPU is slow on an axis of length 3.
-def _min_of_three(values: list[Array]) -> Array:
-    return jnp.minimum(jnp.minimum(values[0], values[1]), values[2])
-
-
-def _max_of_three(values: list[Array]) -> Array:
-    return jnp.maximum(jnp.maximum(values[0], values[1]), values[2])
-
-
 def _rows_of_faces(table: Array, geom: Array) -> list[Array]:
     """Returns each row of `table` [R, M] for the geom of each face. A single geom needs no gather."""
     return [row[0] if table.shape[1] == 1 else _take(row, geom) for row in table]
@@ -116,6 +117,11 @@ def _to_view(projection: Projection, pose: list[Array], point: Vector) -> tuple[
     rows = [pose[i] * x + pose[i + 1] * y + pose[i + 2] * z + pose[i + 3] for i in (0, 4, 8)]
     depth = -rows[2]
     return rows[0], rows[1], jnp.ones_like(depth) if projection.is_parallel else depth, depth
+
+
+def _to_pixels(x: list[Array], w: list[Array], scale: Array, center: Array) -> list[Array]:
+    """Returns the column or row in pixels of corners in front of the viewer; see `_pixel_interval`."""
+    return [center + scale * a / jnp.where(b > _NEAR, b, 1.0) for a, b in zip(x, w, strict=True)]
 
 
 def _pixel_interval(x: list[Array], w: list[Array], scale: Array, center: Array, count: int) -> Array:
@@ -131,14 +137,14 @@ def _pixel_interval(x: list[Array], w: list[Array], scale: Array, center: Array,
       center: f32[] pixels.
       count: number of pixels along the axis.
     """
-    pixel = [center + scale * a / jnp.where(b > _NEAR, b, 1.0) for a, b in zip(x, w, strict=True)]
+    pixel = _to_pixels(x, w, scale, center)
     low_edge, high_edge = (-0.5 - center) / scale, (count - 0.5 - center) / scale
-    is_outside = _max_of_three([a - low_edge * b for a, b in zip(x, w, strict=True)]) < 0.0
-    is_outside |= _min_of_three([a - high_edge * b for a, b in zip(x, w, strict=True)]) > 0.0
-    is_outside |= _max_of_three(w) <= _NEAR
-    is_crossing = _min_of_three(w) <= _NEAR
-    first = jnp.where(is_crossing, 0.0, jnp.clip(jnp.ceil(_min_of_three(pixel) - _MARGIN), 0, count))
-    stop = jnp.where(is_crossing, count, jnp.clip(jnp.floor(_max_of_three(pixel) + _MARGIN) + 1.0, 0, count))
+    is_outside = max_of_three([a - low_edge * b for a, b in zip(x, w, strict=True)]) < 0.0
+    is_outside |= min_of_three([a - high_edge * b for a, b in zip(x, w, strict=True)]) > 0.0
+    is_outside |= max_of_three(w) <= _NEAR
+    is_crossing = min_of_three(w) <= _NEAR
+    first = jnp.where(is_crossing, 0.0, jnp.clip(jnp.ceil(min_of_three(pixel) - _MARGIN), 0, count))
+    stop = jnp.where(is_crossing, count, jnp.clip(jnp.floor(max_of_three(pixel) + _MARGIN) + 1.0, 0, count))
     stop = jnp.where(is_outside, first, jnp.maximum(first, stop))
     return first.astype(jnp.int32) | (stop.astype(jnp.int32) << 16)
 
@@ -148,13 +154,11 @@ def _is_front(x: list[Array], y: list[Array], w: list[Array]) -> Array:
     inverse = [1.0 / jnp.where(b > _NEAR, b, 1.0) for b in w]
     u, v = ([a * b for a, b in zip(axis, inverse, strict=True)] for axis in (x, y))
     area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
-    return (area > 0.0) | (_min_of_three(w) <= _NEAR)
+    return (area > 0.0) | (min_of_three(w) <= _NEAR)
 
 
-def _bounding_rectangles(
-    triangles: Triangles, projection: Projection, size: tuple[int, int], zero: Array
-) -> tuple[Array, Array]:
-    """Returns the columns and the rows of the rectangle that holds each face, as `Pairs` has them."""
+def _bounding_strips(triangles: Triangles, projection: Projection, size: tuple[int, int], zero: Array) -> Strips:
+    """Returns the strip that holds each face."""
     pose = _rows_of_faces(projection.pose, triangles.geom)
     points = [(corner[0], corner[1], corner[2]) for corner in triangles.corners]
     corners = (_to_view(projection, pose, point) for point in points)
@@ -164,7 +168,9 @@ def _bounding_rectangles(
     rows = _pixel_interval([-a for a in y], w, pinhole.scale_y, pinhole.center_y, size[0])
     is_culled = _rows_of_faces(projection.is_culled[None], triangles.geom)[0]
     rows = jnp.where((is_culled > 0.0) & ~_is_front(x, y, w), 0, rows)
-    return materialize((columns, rows), zero)
+    u = _to_pixels(x, w, pinhole.scale_x, pinhole.center_x)
+    v = _to_pixels([-a for a in y], w, pinhole.scale_y, pinhole.center_y)
+    return materialize(narrow_strips(u, v, min_of_three(w) > _NEAR, columns, rows), zero)
 
 
 def _depth_of_hits(
@@ -200,7 +206,7 @@ def _depth_of_hits(
     areas = [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
     total = areas[0] + areas[1] + areas[2]
     hit_depth = (areas[0] * depth[0] + areas[1] * depth[1] + areas[2] * depth[2]) / jnp.where(total == 0.0, 1.0, total)
-    is_inside = ((_min_of_three(areas) >= 0.0) | (_max_of_three(areas) <= 0.0)) & (total != 0.0)
+    is_inside = ((min_of_three(areas) >= 0.0) | (max_of_three(areas) <= 0.0)) & (total != 0.0)
     return jnp.where(is_inside & (projection.is_parallel | (hit_depth > 0.0)), hit_depth, jnp.inf)
 
 
@@ -220,12 +226,12 @@ def _test_batch(
     start, best, faces = state
     num_pixels = height * width
     face = faces_of_pairs(pairs, start, _BATCH, zero)
-    columns, rows, first = materialize([_take(t, face) for t in (pairs.columns, pairs.rows, pairs.first)], zero)
+    strips, first = materialize(jax.tree.map(lambda t: _take(t, face), (pairs.strips, pairs.first)), zero)
     number = start + jnp.arange(_BATCH, dtype=jnp.int32)
-    row, column = materialize(pixels_of_pairs(columns, rows, first, number), zero)
+    row, column, is_inside = materialize(pixels_of_pairs(strips, first, number), zero)
     pixel = (column.astype(jnp.float32), row.astype(jnp.float32))
     depth = materialize(_depth_of_hits(triangles, projection, face, pixel, zero), zero)
-    is_hit = (number < pairs.stop[-1]) & (depth < jnp.inf)
+    is_hit = is_inside & (number < pairs.stop[-1]) & (depth < jnp.inf)
     target = materialize(jnp.where(is_hit, row * width + column, num_pixels), zero)
     best = best.at[target].min(depth, mode="drop")
     is_best = depth <= _take(best, jnp.minimum(target, num_pixels - 1))
@@ -244,12 +250,12 @@ def rasterize(triangles: Triangles, projection: Projection, size: tuple[int, int
 
     Returns:
       Nearest face and depth of each pixel. All depths are NaN if there are more than about 2^31 pairs of a face and a
-      pixel of the rectangle around the face.
+      pixel of its strip.
     """
-    columns, rows = _bounding_rectangles(triangles, projection, size, zero)
-    count = count_pairs(columns, rows)
+    strips = _bounding_strips(triangles, projection, size, zero)
+    count = count_pairs(strips)
     stop = materialize(jnp.cumsum(count), zero)
-    pairs = Pairs(columns, rows, materialize(stop - count, zero), stop)
+    pairs = Pairs(strips, materialize(stop - count, zero), stop)
     num_pixels = size[0] * size[1]
     initial = (jnp.zeros_like(zero), jnp.full(num_pixels, jnp.inf, jnp.float32), jnp.zeros(num_pixels, jnp.int32))
     step = functools.partial(_test_batch, triangles, projection, pairs, (size, zero))
