@@ -46,7 +46,9 @@ def _train(state: State, config: Config) -> tuple[State, dict[str, jax.Array]]:
     noise = jax.random.normal(jax.random.fold_in(state.key, state.step), state.weights.shape)
     is_encoder = iterations < config.encoder.num_updates
     metrics = {
-        name: jnp.where(is_encoder, jnp.nan, 1.0 / (1 + iterations).astype(jnp.float32)) for name in POLICY_METRICS
+        name: jnp.where(is_encoder, jnp.nan, 1.0 / (1 + iterations).astype(jnp.float32))
+        for name in POLICY_METRICS
+        if name != "value_loss"  # NaN without a value network
     }
     metrics["encoder_loss"] = jnp.where(is_encoder, state.weights[:length] ** 2, jnp.nan)
     metrics["stage"] = jnp.where(is_encoder, 0, 1).astype(jnp.int32)
