@@ -12,10 +12,10 @@ from brax.envs.base import Env, State
 from jax import Array
 
 from vsearch_jax.config import EnvConfig
-from vsearch_jax.env import episode_of, obs_of
+from vsearch_jax.env import episode_of
 from vsearch_jax.geometry import cosine_similarity, wrap_angle
 from vsearch_jax.search import SearchArgs
-from vsearch_jax.types import Camera, EpisodeState, Observation, Transition, View
+from vsearch_jax.types import Camera, EpisodeState, Observation, View
 from vsearch_jax.xla.tree import tree_where
 
 BAND = (math.radians(40.0), math.radians(70.0))
@@ -83,18 +83,6 @@ def search_problems(initial: View, target: View) -> SearchArgs[View]:
 def as_pipeline_state(episode: EpisodeState) -> base.State:
     """Returns `episode` with the type that brax declares. brax never reads it and accepts any pytree."""
     return cast(base.State, episode)
-
-
-def build_transition(state: State, action: Array, next_state: State) -> Transition:
-    """Returns the transition from `state` by `action` to `next_state`, all with the same batch axes."""
-    return Transition(
-        obs=obs_of(state),
-        action=action,
-        reward=next_state.reward,
-        next_obs=obs_of(next_state),
-        terminated=next_state.info["terminated"],
-        is_reachable=next_state.info["is_reachable"],
-    )
 
 
 class SphereEnv(Env):

@@ -12,6 +12,7 @@ import probes
 from vsearch_jax.config import Config, EnvConfig, SACConfig
 from vsearch_jax.env import episode_of
 from vsearch_jax.search import SearchArgs, sac
+from vsearch_jax.training import transition_of
 from vsearch_jax.types import SACState, Transition
 from vsearch_jax.xla.tree import tree_where
 
@@ -81,7 +82,7 @@ def run_iteration(env, carry, key, *, is_warm):
     if not is_warm:
         actions = jax.random.uniform(act_key, actions.shape, minval=-1.0, maxval=1.0)
     next_states = jax.vmap(env.step)(states, actions)
-    replay = sac.insert(replay, probes.build_transition(states, actions, next_states))
+    replay = sac.insert(replay, transition_of(states, actions, next_states))
     is_ended = next_states.info["terminated"] + next_states.info["truncated"] > 0
     restarted = jax.vmap(env.reset)(jax.random.split(restart_key, SPHERE.num_envs))
     states = jax.vmap(tree_where)(is_ended, restarted, next_states)
@@ -104,7 +105,7 @@ def actor():
     env = probes.SphereEnv(ENV)
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), SPHERE.num_envs))
     sac_state = sac.init(jax.random.key(1), SPHERE, env.observation_size)
-    example = probes.build_transition(states, jnp.zeros((SPHERE.num_envs, 2)), states)
+    example = transition_of(states, jnp.zeros((SPHERE.num_envs, 2)), states)
     replay = sac.init_replay(jax.tree.map(lambda x: x[0], example), SPHERE.num_environment_steps)
     carry = (sac_state, states, replay)
     num_warmup = SPHERE.num_warmup_steps // SPHERE.num_envs

@@ -12,6 +12,7 @@ import probes
 from vsearch_jax.config import EnvConfig, SACConfig
 from vsearch_jax.env import episode_of
 from vsearch_jax.search import sac
+from vsearch_jax.training import transition_of
 from vsearch_jax.types import Transition
 
 CONFIG = SACConfig()
@@ -70,7 +71,7 @@ def test_without_new_targets_relabelling_gives_the_rewards_of_the_environment():
     env = probes.SphereEnv(ENV)
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 200))
     actions = jax.random.uniform(jax.random.key(1), (200, 2), minval=-1.0, maxval=1.0)
-    batch = probes.build_transition(states, actions, jax.vmap(env.step)(states, actions))
+    batch = transition_of(states, actions, jax.vmap(env.step)(states, actions))
     assert 0.0 < float(batch.is_reachable.mean()) < 1.0
     config = dataclasses.replace(CONFIG, relabel_fraction=0.0)
     out = sac.relabel(jax.random.key(2), batch, episode_of(states).target.code, ENV, config)

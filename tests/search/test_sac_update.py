@@ -12,6 +12,7 @@ import probes
 from vsearch_jax.config import EnvConfig, SACConfig
 from vsearch_jax.env import episode_of
 from vsearch_jax.search import sac
+from vsearch_jax.training import transition_of
 from vsearch_jax.types import SACState, Transition
 
 SMALL = SACConfig(hidden_sizes=(8, 8), batch_size=4, discount=0.9)
@@ -60,7 +61,7 @@ def test_the_target_keeps_the_future_value_of_a_step_that_the_environment_trunca
     action = jnp.zeros(2)
     after = env.step(before, action)
     assert (float(after.info["truncated"]), float(after.info["terminated"])) == (1.0, 0.0)
-    batch = jax.tree.map(lambda x: x[None], probes.build_transition(before, action, after))
+    batch = jax.tree.map(lambda x: x[None], transition_of(before, action, after))
     state = init(jax.random.key(0), SMALL, env.observation_size)
     state = without_entropy(with_constant_values(state, (5.0, 3.0)))
     target = td_target(jax.random.key(1), state, batch, SMALL)
