@@ -44,6 +44,8 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
 
+    if options.run and runs.latest_step(options.run) is None:
+        parser.error(f"--run {options.run}: holds no run; name the folder of a run, or leave the option out")
     run = options.run or options.out / "run"
     state, config = _trained_run(run, options.preset, options.seed, options.quick)
     band = np.rad2deg(np.asarray(state.reach.band))

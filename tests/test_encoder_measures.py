@@ -45,7 +45,7 @@ def make_codes(images: ModuleType, turns: int, shift_deg: float):
     views = np.array([[13.0, 41.0], [-176.0, 58.0]])[:, None].repeat(3, axis=1)
     moved = views + np.array([shift_deg, 0.0])
     disturbed = {name: codes_of(views if name == "none" else moved, turns) for name in images.DISTURBANCES}
-    return images.Codes(codes_of(grid, turns), cameras, disturbed, cameras)
+    return images.Codes(codes_of(grid, turns), cameras, disturbed)
 
 
 def test_an_unambiguous_code_has_its_known_sharpness_and_no_wrong_match(sections) -> None:

@@ -18,6 +18,7 @@ from vsearch_jax.geometry import view_from_uniform
 from vsearch_jax.training import encoder_iteration, fill_pool
 from vsearch_jax.types import Camera, EncoderState, ReachabilityMap, View
 from vsearch_jax.xla.batching import map_in_batches
+from vsearch_jax.xla.tree import tree_where
 
 DISTURBANCES = ("none", "arm", "light", "occlusion", "shift", "noise", "blur")
 """`none` and `arm` have random arm configurations; the others have one configuration for each view."""
@@ -53,13 +54,11 @@ class Codes(NamedTuple):
       grid: f32[A, E, Z], codes of clean views on a grid over the band, each with another arm configuration.
       grid_camera: cameras of the grid, leading axes [A, E].
       disturbed: {kind: f32[V, D, Z]}, codes of V views with D disturbances each.
-      camera: cameras of the V views.
     """
 
     grid: Array
     grid_camera: Camera
     disturbed: dict[str, Array]
-    camera: Camera
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -130,7 +129,6 @@ def encode_views(key: Array, encoder: EncoderState, reach: ReachabilityMap, conf
         grid=codes[:num_grid].reshape(*grid_shape, -1),
         grid_camera=jax.tree.map(lambda x: x[:num_grid].reshape(*grid_shape, *x.shape[1:]), camera),
         disturbed={name: disturbed[:, i] for i, name in enumerate(DISTURBANCES)},
-        camera=jax.tree.map(lambda x: x[num_grid:].reshape(*shape, *x.shape[1:])[:, 0, 0], camera),
     )
 
 
@@ -146,9 +144,9 @@ def _encode(env: vs.ViewSearchEnv, joints_key: Array, item: tuple[Array, View, A
     data, camera = env.forward(qpos)
 
     lit = encoders.randomize_lights(light_key, env.render_scene, env.center)
-    scene = jax.tree.map(lambda a, b: jnp.where(kind == DISTURBANCES.index("light"), a, b), lit, env.render_scene)
+    scene = tree_where(kind == DISTURBANCES.index("light"), lit, env.render_scene)
     moved = encoders.jitter_camera(camera_key, camera)
-    seen = jax.tree.map(lambda a, b: jnp.where(kind == DISTURBANCES.index("shift"), a, b), moved, camera)
+    seen = tree_where(kind == DISTURBANCES.index("shift"), moved, camera)
     size = env.config.scene.image_size
     pixels = encoders.network_input(
         render.render(scene, data, seen, (size, size)), jnp.asarray(env.scene.object_geom_ids), env.config

@@ -48,8 +48,8 @@ def thesis_config(config: Config, is_quick: bool) -> Config:
         batch_size=episodes,
     )
     task = dataclasses.replace(config.env, target="fixed")
-    whole = dataclasses.replace(config, sac=policy, env=task, evaluation=evaluation, num_chunks=1)
-    return dataclasses.replace(whole, num_chunks=4 if is_quick else 20)
+    num_chunks = 4 if is_quick else 20
+    return dataclasses.replace(config, sac=policy, env=task, evaluation=evaluation, num_chunks=num_chunks)
 
 
 def train_policies(run: Path, encoder_of: TrainState, config: Config, seed: int) -> TrainState:
