@@ -17,6 +17,7 @@ import trimesh
 import vsearch_jax as vs
 from samples import fast_run
 from vsearch_jax import render, runs
+from vsearch_jax.report import page
 from vsearch_jax.runs import loop
 from vsearch_jax.search import LABELS
 
@@ -51,10 +52,11 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replaces init, train and evaluate by those of the fast run, without its pauses."""
+    """Replaces init, train, evaluate and the figures by those of the fast run, without its pauses."""
     for name in ("init", "train", "evaluate"):
         for module in (vs, loop):
             monkeypatch.setattr(module, name, getattr(fast_run, name))
+    monkeypatch.setattr(page, "draw_figures", fast_run.draw_figures)
     monkeypatch.setattr(fast_run, "CHUNK_SECONDS", 0.0)
 
 

@@ -1,4 +1,4 @@
-"""A fast stand-in for init, train, evaluate and record_search, without a scene and networks.
+"""A fast stand-in for init, train, evaluate, record_search and the figures, without a scene and networks.
 
 Tests of the loop of a run and of the command line use it. As a program it is the command `vsearch` with this stand-in:
 `PYTHONPATH=tests python -m samples.fast_run train --preset smoke --out DIR`.
@@ -11,10 +11,12 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+from matplotlib.figure import Figure
 
 from samples import made_up
 from vsearch_jax.cli.main import main
 from vsearch_jax.config import Config
+from vsearch_jax.report import page
 from vsearch_jax.runs import loop
 from vsearch_jax.training import POLICY_METRICS
 from vsearch_jax.types import ReachabilityMap
@@ -72,9 +74,15 @@ def record_search(state: State, config: Config) -> dict[str, Any]:
     return made_up.search()
 
 
+def draw_figures(*results: Any) -> dict[str, Figure]:
+    """Returns empty figures. The tests of the report draw the real ones, which takes seconds."""
+    return {name: Figure(figsize=(0.5, 0.5)) for name in page.CAPTIONS}
+
+
 def install() -> None:
     """Replaces the functions of the real run."""
     loop.init, loop.train, loop.evaluate, loop.record_search = init, train, evaluate, record_search
+    page.draw_figures = draw_figures
 
 
 if __name__ == "__main__":

@@ -40,8 +40,15 @@ def make_map() -> ReachabilityMap:
 def steps():
     pool, degrees = make_pool()
     indexed = sac.index_pool(pool, make_map())
-    made = sac.sample_pool_steps(jax.random.key(3), indexed, NUM_STEPS, CONFIG)
+    made, _ = sac.sample_pool_steps(jax.random.key(3), indexed, NUM_STEPS, CONFIG)
     return jax.tree.map(np.asarray, made), np.asarray(pool.code), degrees
+
+
+def change_deg(degrees: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Returns the change f64[N, 2] of azimuth and elevation between views by their indices, the short way round."""
+    change = degrees[end] - degrees[start]
+    change[:, 0] = (change[:, 0] + 180.0) % 360.0 - 180.0
+    return change
 
 
 def test_the_action_leads_from_the_first_view_to_the_second(steps):
@@ -52,8 +59,7 @@ def test_the_action_leads_from_the_first_view_to_the_second(steps):
     is_reachable = made.is_reachable > 0.5
     np.testing.assert_array_equal(start[~is_reachable], end[~is_reachable])
     start, end, action = start[is_reachable], end[is_reachable], made.action[is_reachable]
-    change = degrees[end] - degrees[start]
-    change[:, 0] = (change[:, 0] + 180.0) % 360.0 - 180.0
+    change = change_deg(degrees, start, end)
     wanted = np.clip(change / CONFIG.action_scale_deg, -1.0, 1.0)
     np.testing.assert_allclose(action, wanted, atol=1e-4)
     # The pool is sparse, so the nearest view can be some degrees beyond the longest step.
@@ -87,8 +93,18 @@ def test_a_third_of_the_targets_is_the_end_of_the_step_and_a_third_is_near_it(st
     made, code, degrees = steps
     end = made.next_obs[:, -1].astype(int)
     target = np.argmin(np.linalg.norm(code[None] - made.obs[:, None, 16:32], axis=-1), axis=-1)
-    offset = degrees[target] - degrees[end]
-    offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
-    distance = np.linalg.norm(offset, axis=-1)
+    distance = np.linalg.norm(change_deg(degrees, end, target), axis=-1)
     assert (target == end).mean() == pytest.approx(1 / 3, abs=0.15)  # a near target can be the end too
     assert (distance < 20.0).mean() == pytest.approx(0.7, abs=0.1)
+
+
+def test_known_actions_lead_to_every_target_within_one_step_and_only_to_those():
+    pool, degrees = make_pool()
+    _, known = sac.sample_pool_steps(jax.random.key(3), sac.index_pool(pool, make_map()), NUM_STEPS, CONFIG)
+    obs, action, is_known = (np.asarray(x) for x in known)
+    start = obs[:, -1].astype(int)
+    target = np.argmin(np.linalg.norm(np.asarray(pool.code)[None] - obs[:, None, 16:32], axis=-1), axis=-1)
+    change = change_deg(degrees, start, target)
+    np.testing.assert_array_equal(is_known, np.abs(change).max(axis=-1) <= CONFIG.action_scale_deg)
+    assert 0.5 < is_known.mean() < 0.9
+    np.testing.assert_allclose(action * CONFIG.action_scale_deg, change, atol=2e-3)

@@ -13,7 +13,7 @@ from vsearch_jax.config import EnvConfig, SACConfig
 from vsearch_jax.env import episode_of
 from vsearch_jax.search import sac
 from vsearch_jax.training import transition_of
-from vsearch_jax.types import SACState, Transition
+from vsearch_jax.types import KnownActions, SACState, Transition
 
 SMALL = SACConfig(hidden_sizes=(8, 8), batch_size=4, discount=0.9)
 
@@ -96,6 +96,23 @@ def test_an_update_changes_the_target_critics_by_tau_and_the_temperature_towards
     assert float(update(jax.random.key(1), state, batch, high_entropy)[0].log_alpha) > float(state.log_alpha)
     assert np.isnan(metrics.pop("value_loss"))
     assert all(np.isfinite(value) for value in metrics.values())
+
+
+def test_the_mean_action_comes_to_equal_the_known_actions_and_only_these():
+    config = dataclasses.replace(SMALL, imitation_weight=100.0, num_warmup_steps=16, learning_rate=1e-2)
+    state, batch = init(jax.random.key(0), config, 6), transitions([1.0, 0.0, -1.0, 0.5], [0, 1, 0, 0])
+    wanted = jnp.asarray([[0.4, -0.7], [-0.2, 0.1], [5.0, 5.0], [-5.0, 5.0]])
+    known = KnownActions(batch.next_obs, wanted, jnp.asarray([1.0, 1.0, 0.0, 0.0]))
+
+    def step(i, state):
+        return sac.update(jax.random.fold_in(jax.random.key(1), i), state, batch, config, known)[0]
+
+    state = jax.jit(functools.partial(jax.lax.fori_loop, 0, 300, step))(state)
+    action = sac.act(None, state.actor, batch.next_obs, config)
+    np.testing.assert_allclose(action[:2], wanted[:2], atol=0.03)
+    unknown = known._replace(is_known=jnp.zeros(4))
+    with_none, with_unknown = (update(jax.random.key(1), state, batch, config, k)[0].actor for k in (None, unknown))
+    jax.tree.map(np.testing.assert_array_equal, with_none, with_unknown)
 
 
 def test_with_a_value_network_its_copy_changes_by_tau_and_the_temperature_stays():

@@ -78,6 +78,8 @@ class SACConfig:
     """Rate of the target critic's moving average."""
     pool_fraction: float = 0.5
     """Fraction of a batch that are steps between views of the pool, which need no new image."""
+    imitation_weight: float = 30.0
+    """Weight of the actor's error in pool steps whose target is within one step, where the right action is known."""
     relabel_fraction: float = 0.8
     """Fraction of the replayed steps with a new target: 2/3 of it a random view, 1/3 the view that the step reached."""
 
@@ -99,7 +101,8 @@ class SACConfig:
         require_unit(self, "discount", "pool_fraction", "relabel_fraction", "tau")
         allowed = f"below {1.0 - 0.5 / self.batch_size:g}, so that a batch of {self.batch_size} holds a real step"
         require(self, "pool_fraction", round(self.pool_fraction * self.batch_size) < self.batch_size, allowed)
-        require_finite(self, "target_entropy")
+        require_finite(self, "target_entropy", "imitation_weight")
+        require(self, "imitation_weight", self.imitation_weight >= 0.0, "0 or more")
         require(
             self,
             "num_environment_steps",

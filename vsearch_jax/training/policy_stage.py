@@ -104,10 +104,11 @@ def _policy_update(
     num_pool_steps = round(config.sac.pool_fraction * config.sac.batch_size)
     transitions = sac.sample_batch(sample_key, replay, config.sac.batch_size - num_pool_steps)
     transitions = sac.relabel(relabel_key, transitions, pool.observations.code, config.env, config.sac)
+    known = None
     if num_pool_steps > 0:
-        made = sac.sample_pool_steps(pool_key, pool, num_pool_steps, config.env)
+        made, known = sac.sample_pool_steps(pool_key, pool, num_pool_steps, config.env)
         transitions = jax.tree.map(lambda *x: jnp.concatenate(x), transitions, made)
-    return sac.update(update_key, carry[0], transitions, config.sac)
+    return sac.update(update_key, carry[0], transitions, config.sac, known if config.sac.imitation_weight > 0 else None)
 
 
 def transition_of(state: State, action: Array, next_state: State) -> Transition:

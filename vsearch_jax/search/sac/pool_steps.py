@@ -13,7 +13,7 @@ from jax import Array
 from vsearch_jax.config import EnvConfig
 from vsearch_jax.env import step_reward
 from vsearch_jax.geometry import angle_difference, cosine_similarity, fold_into_band, view_from_uniform, wrap_angle
-from vsearch_jax.types import Observation, ReachabilityMap, Transition, View
+from vsearch_jax.types import KnownActions, Observation, ReachabilityMap, Transition, View
 
 _OWN_SHARE, _NEAR_SHARE = 1 / 3, 1 / 3
 """Shares of the targets that are the end of the step, and that are near it. The others are random views of the pool."""
@@ -58,7 +58,9 @@ def index_pool(pool: Observation, reach: ReachabilityMap) -> IndexedPool:
     return IndexedPool(pool, reach, jax.lax.map(jax.vmap(nearest), cells))
 
 
-def sample_pool_steps(key: Array, indexed: IndexedPool, num_steps: int, config: EnvConfig) -> Transition:
+def sample_pool_steps(
+    key: Array, indexed: IndexedPool, num_steps: int, config: EnvConfig
+) -> tuple[Transition, KnownActions]:
     """Draws random steps of the task between two views of the pool.
 
     A step starts at a random view of the pool. Its action is uniform, with the elevation folded into the band. It ends
@@ -68,6 +70,9 @@ def sample_pool_steps(key: Array, indexed: IndexedPool, num_steps: int, config: 
     One third of the targets are the end itself, one third are near it, and one third are random. Near targets teach the
     policy what misses the threshold by little. The arm's joints before and after the step are unrelated.
 
+    The views are known, so the action that leads from the start straight to the target is known too if one step is
+    enough.
+
     Args:
       key: PRNG key.
       indexed: the pool, from `index_pool`.
@@ -75,7 +80,7 @@ def sample_pool_steps(key: Array, indexed: IndexedPool, num_steps: int, config: 
       config: size of an action, threshold and rewards.
 
     Returns:
-      The steps: a Transition with leading axis N.
+      The steps: a Transition with leading axis N. And the actions that lead to the targets, from the same starts.
     """
     start_key, action_key, beyond_key, target_key = jax.random.split(key, 4)
     pool, scale = indexed.observations, math.radians(config.action_scale_deg)
@@ -85,15 +90,13 @@ def sample_pool_steps(key: Array, indexed: IndexedPool, num_steps: int, config: 
     is_beyond = jax.random.uniform(beyond_key, (num_steps,)) < _BEYOND_SHARE
     is_reachable = ~is_beyond | _may_be_reachable(indexed.reach, commanded)
     end = jnp.where(is_reachable, _neighbours(indexed, commanded), start)
-    moved = [
-        angle_difference(pool.view.azimuth[end], pool.view.azimuth[start]),
-        pool.view.elevation[end] - pool.view.elevation[start],
-    ]
-    action = jnp.where(is_reachable, jnp.clip(jnp.stack(moved) / scale, -1.0, 1.0), wanted)
-    target = pool.code[_targets(target_key, indexed, end)]
+    action = jnp.where(is_reachable, jnp.clip(_change(pool.view, start, end) / scale, -1.0, 1.0), wanted)
+    targets = _targets(target_key, indexed, end)
+    target, straight = pool.code[targets], _change(pool.view, start, targets) / scale
+    is_known = jnp.max(jnp.abs(straight), axis=0) <= 1.0
     reward, is_found = step_reward(cosine_similarity(pool.code[end], target), is_reachable, config)
     obs, next_obs = (jnp.concatenate([pool.code[i], target, pool.qpos[i]], axis=-1) for i in (start, end))
-    return Transition(
+    steps = Transition(
         obs=obs,
         action=action.T,
         reward=reward,
@@ -101,6 +104,13 @@ def sample_pool_steps(key: Array, indexed: IndexedPool, num_steps: int, config: 
         terminated=is_found.astype(jnp.float32),
         is_reachable=is_reachable.astype(jnp.float32),
     )
+    return steps, KnownActions(obs=obs, action=straight.T, is_known=is_known.astype(jnp.float32))
+
+
+def _change(views: View, start: Array, end: Array) -> Array:
+    """Returns f32[2, N] rad, the changes of azimuth and elevation between views with the indices `start` and `end`."""
+    azimuth = angle_difference(views.azimuth[end], views.azimuth[start])
+    return jnp.stack([azimuth, views.elevation[end] - views.elevation[start]])
 
 
 def _may_be_reachable(reach: ReachabilityMap, view: View) -> Array:
