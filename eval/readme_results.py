@@ -1,6 +1,8 @@
-"""Writes the results section of README.md from a run's results.json: `python eval/readme_results.py [RUN]`.
+"""Writes the results of README.md from the files in docs/results: `python eval/readme_results.py [NAME=FOLDER ...]`.
 
-With a run, its results.json is copied to docs/results/teapot.json first. Commit both files.
+Each FOLDER is that of a run or of an evaluation. Its results.json is copied to docs/results/NAME.json first. `teapot`
+is the run of the large table, `teapot-dynamic` its evaluation with dynamics. All other names are rows of the table of
+other runs, in the order of the names. `moves.json` is written by eval/moves.py. Commit README.md and the files.
 """
 
 from __future__ import annotations
@@ -9,15 +11,18 @@ import argparse
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from vsearch_jax.report.summary import Results, false_positive_warning
 from vsearch_jax.report.table import table_rows
 from vsearch_jax.search import LABELS
 
 ROOT = Path(__file__).resolve().parents[1]
-README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results" / "teapot.json"
-BEGIN, END = "<!-- results: written by eval/readme_results.py -->", "<!-- end of results -->"
+README, FOLDER = ROOT / "README.md", ROOT / "docs" / "results"
+MAIN, DYNAMIC, MOVES = "teapot", "teapot-dynamic", "moves"
+"""Names of the files with a section of their own."""
 
 
 def results_section(results: Results) -> str:
@@ -48,27 +53,92 @@ def results_section(results: Results) -> str:
     return "\n".join([*lines, *([f"- {warning}"] if warning else [])]) + "\n"
 
 
-def with_section(readme: str, section: str) -> str:
-    """Returns the text of README.md with the section between its two marks replaced.
+def other_runs_section(runs: dict[str, Results]) -> str:
+    """Returns a table as Markdown: one row for each run, and in each cell one number for each searcher.
+
+    Args:
+      runs: {name: content of results.json}.
+    """
+    columns: dict[str, Callable[[Results], str]] = {
+        "pose success, error ≤ 10° (%)": lambda row: f"{100 * row['pose_success_rate']:.1f}",
+        "images or steps, mean": lambda row: f"{row['evaluations_mean']:.1f}",
+        "rotational error, median (°)": lambda row: f"{row['rotation_error_deg_median']:.1f}",
+        "false positives (%)": lambda row: f"{100 * row['false_positive_rate']:.1f}",
+    }
+    lines = ["| run | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    for name, results in runs.items():
+        cells = [" / ".join(number(results[searcher]) for searcher in LABELS) for number in columns.values()]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def dynamics_section(kinematic: Results, dynamic: Results, moves: dict[str, Any] | None) -> str:
+    """Returns a table as Markdown that compares two evaluations of one run, and a sentence on the arm's accuracy.
+
+    Args:
+      kinematic: content of results.json with joints set.
+      dynamic: the same with the arm's dynamics.
+      moves: content of the file that eval/moves.py writes, if there is one.
+    """
+    rows: dict[str, Callable[[Results], str]] = {
+        "pose success, error ≤ 10° (%)": lambda row: f"{100 * row['pose_success_rate']:.2f}",
+        "images or steps, mean": lambda row: f"{row['evaluations_mean']:.2f}",
+        "rotational error, mean (°)": lambda row: f"{row['rotation_error_deg_mean']:.2f}",
+        "joint travel, mean (rad)": lambda row: f"{row['joint_travel_rad_mean']:.1f}",
+        "motion time, mean (s)": lambda row: f"{row['motion_time_s_mean']:.1f}",
+    }
+    lines = ["| joints set / dynamics | " + " | ".join(LABELS.values()) + " |", "|---" * (len(LABELS) + 1) + "|"]
+    for label, number in rows.items():
+        cells = [f"{number(kinematic[name])} / {number(dynamic[name])}" for name in LABELS]
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    seconds = [results["wall_seconds"]["evaluation"] for results in (kinematic, dynamic)]
+    lines += ["", f"The evaluation took {seconds[0]:.0f} s with joints set, {seconds[1]:.0f} s with dynamics."]
+    if moves is not None:
+        lines[-1] += (
+            f" In {moves['planned']} random moves the camera came to rest "
+            f"{moves['rest_error_micrometre_median']:.1f} µm from the plan (median; at most "
+            f"{moves['rest_error_micrometre_max']:.1f} µm)."
+        )
+    return "\n".join(lines) + "\n"
+
+
+def sections() -> dict[str, str]:
+    """Returns the generated sections of README.md by name. A section without files is empty."""
+    files = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.json"))}
+    others = {name: results for name, results in files.items() if name not in (MAIN, DYNAMIC, MOVES)}
+    has_dynamic = DYNAMIC in files
+    return {
+        "results": results_section(files[MAIN]),
+        "other runs": other_runs_section(others) if others else "",
+        "dynamics": dynamics_section(files[MAIN], files[DYNAMIC], files.get(MOVES)) if has_dynamic else "",
+    }
+
+
+def with_sections(readme: str, texts: dict[str, str]) -> str:
+    """Returns the text of README.md with the text between the two marks of each section replaced.
 
     Args:
       readme: text of README.md.
-      section: the new section.
+      texts: new text of each section, by name.
     """
-    before, rest = readme.split(BEGIN)
-    return before + BEGIN + "\n\n" + section + "\n" + END + rest.split(END)[1]
+    for name, text in texts.items():
+        begin, end = f"<!-- {name}: written by eval/readme_results.py -->", f"<!-- end of {name} -->"
+        before, rest = readme.split(begin)
+        readme = before + begin + "\n\n" + text + "\n" + end + rest.split(end)[1]
+    return readme
 
 
 def main(arguments: list[str]) -> None:
     """Writes README.md."""
-    parser = argparse.ArgumentParser(description="Writes the results section of README.md.")
-    parser.add_argument("run", type=Path, nargs="?", help="folder of a finished run of the preset `cpu`")
-    options = parser.parse_args(arguments)
-    if options.run:
-        RESULTS.parent.mkdir(exist_ok=True)
-        shutil.copyfile(options.run / "results.json", RESULTS)
-    results = json.loads(RESULTS.read_text(encoding="utf-8"))
-    README.write_text(with_section(README.read_text(encoding="utf-8"), results_section(results)), encoding="utf-8")
+    parser = argparse.ArgumentParser(description="Writes the results of README.md.")
+    parser.add_argument("runs", nargs="*", metavar="NAME=FOLDER", help="a folder with a results.json to copy first")
+    for item in parser.parse_args(arguments).runs:
+        name, _, folder = item.partition("=")
+        if not name or not folder:
+            parser.error(f"{item!r} is not of the form NAME=FOLDER")
+        FOLDER.mkdir(exist_ok=True)
+        shutil.copyfile(Path(folder) / "results.json", FOLDER / f"{name}.json")
+    README.write_text(with_sections(README.read_text(encoding="utf-8"), sections()), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ class SACConfig:
     """Number of updates for each environment step."""
     batch_size: int = 256
     """Number of transitions in an update."""
-    hidden_sizes: tuple[int, ...] = (128, 128)
+    hidden_sizes: tuple[int, ...] = (256, 256)
     """Number of units in each hidden layer of actor and critic."""
     learning_rate: float = 1e-3
     """Initial step size of Adam, for actor, critic and temperature. It falls linearly to zero over the run."""

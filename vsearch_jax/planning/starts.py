@@ -18,6 +18,7 @@ from vsearch_jax.planning import levenberg
 from vsearch_jax.planning.levenberg import Goal, goal_from_pose
 from vsearch_jax.robot.arm import Arm, forward_kinematics, is_free
 from vsearch_jax.types import IKResult, IKStatus
+from vsearch_jax.xla.trace_once import trace_once
 
 
 def ik_from_starts(
@@ -49,6 +50,7 @@ def ik_from_starts(
     return jax.tree.map(lambda leaf: leaf[best], results), is_valid[best]
 
 
+@trace_once("config")
 def solve_starts(
     arm: Arm,
     T_world_camera: SE3,

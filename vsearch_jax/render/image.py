@@ -32,6 +32,7 @@ from vsearch_jax.render.tiling import Tiling
 from vsearch_jax.types import Camera, Image
 from vsearch_jax.xla.batching import map_in_batches
 from vsearch_jax.xla.materialize import materialize, runtime_zero
+from vsearch_jax.xla.trace_once import trace_once
 from vsearch_jax.xla.vectors import Vector
 
 # Height and width of a tile on a CPU. About forty planes of a batch of such tiles fit into the cache, and a tile has to
@@ -95,8 +96,14 @@ def render(scene: RenderScene, data: GeomPoses, camera: Camera, size: tuple[int,
     """
     if not all(0 < count <= _MAX_EDGE for count in size):
         raise RenderError(f"size is {size}; allowed: height and width from 1 to {_MAX_EDGE}")
-    tiling = _choose_tiling(size)
     frames, lights = _camera_frames(scene, data, camera), light_poses(scene, data, camera)
+    return _draw(scene, frames, lights, camera, (size[0], size[1]))
+
+
+@trace_once("size")
+def _draw(scene: RenderScene, frames: trace.Frames, lights: LightPoses, camera: Camera, size: tuple[int, int]) -> Image:
+    """Returns the image of a scene whose geoms and lights have the given poses relative to the camera."""
+    tiling = _choose_tiling(size)
     zero = runtime_zero(frames.origin)
     pixels = pinhole(camera, size)
     # Without a fusion boundary, XLA computes the tangent and the matrix products again in every pixel.
