@@ -15,7 +15,7 @@ FOOTNOTE = (
     "Pose success: the cosine meets the threshold, and the rotation error is small. "
     "Ours: all trials, with 95 % intervals that count trials of one initial view or of one policy as related. "
     "Thesis: the means of random search and CMA-ES cover only the trials that met the threshold; SAC has one target. "
-    "One sample in ten of our random search is uniform over the band. "
+    "Some samples of our random search are uniform over the band (random_search.num_wide). "
     "Travel and time of motions ignore obstacles where a view counts as reachable by IK."
 )
 

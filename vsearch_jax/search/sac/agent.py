@@ -97,7 +97,7 @@ def update(
 
     Returns:
       Parameters and optimizer states after the step, and metrics f32[]: `critic_loss`, `value_loss` (NaN for
-      `twin_q`), `actor_loss`, `alpha` (the temperature before the step), `entropy` in nats.
+      `twin_q`), `actor_loss` (with the part of `known`), `alpha` (the temperature before the step), `entropy` in nats.
     """
     target_key, actor_key = jax.random.split(key)
     target = td_target(target_key, state, transitions, config)
