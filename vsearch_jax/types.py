@@ -189,20 +189,6 @@ class Transition(NamedTuple):
     is_reachable: Array
 
 
-class KnownActions(NamedTuple):
-    """Policy inputs for some of which the right action is known, because the target is within one step.
-
-    Attributes:
-      obs: f32[N, D], policy inputs.
-      action: f32[N, 2] in [-1, 1], the action that leads to the target. Meaningless where it is not known.
-      is_known: f32[N], 1 where the action is known, else 0.
-    """
-
-    obs: Array
-    action: Array
-    is_known: Array
-
-
 @flax.struct.dataclass
 class ReplayState:
     """The replay buffer: a ring of the newest transitions.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -84,12 +86,20 @@ def test_face_that_reaches_behind_the_camera_is_drawn() -> None:
     np.testing.assert_allclose(np.asarray(image.depth)[is_same], depth[is_same], rtol=1e-4)
 
 
-def test_depth_is_nan_if_there_are_too_many_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def few_pairs(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Lets the rasteriser count to 100 only. The renderer keeps its traces, so they are dropped before and after."""
+    jax.clear_caches()
+    monkeypatch.setattr(rasterizer, "_MAX_PAIRS", 100.0)
+    yield
+    jax.clear_caches()
+
+
+def test_depth_is_nan_if_there_are_too_many_pairs(few_pairs: None) -> None:
     model = _mesh_model()
     data = forward(model)
     frames, scene = poses(model, data), render.compile_scene(model)
     eye = render.camera(frames, model, "eye")
-    monkeypatch.setattr(rasterizer, "_MAX_PAIRS", 100.0)
     depth = jax.jit(lambda eye: render.render(scene, frames, eye, SIZE).depth)(eye)
     assert np.isnan(depth).all()
 

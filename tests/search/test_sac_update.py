@@ -13,7 +13,7 @@ from vsearch_jax.config import EnvConfig, SACConfig
 from vsearch_jax.env import episode_of
 from vsearch_jax.search import sac
 from vsearch_jax.training import transition_of
-from vsearch_jax.types import KnownActions, SACState, Transition
+from vsearch_jax.types import SACState, Transition
 
 SMALL = SACConfig(hidden_sizes=(8, 8), batch_size=4, discount=0.9)
 
@@ -102,7 +102,7 @@ def test_the_mean_action_comes_to_equal_the_known_actions_and_only_these():
     config = dataclasses.replace(SMALL, imitation_weight=100.0, num_warmup_steps=16, learning_rate=1e-2)
     state, batch = init(jax.random.key(0), config, 6), transitions([1.0, 0.0, -1.0, 0.5], [0, 1, 0, 0])
     wanted = jnp.asarray([[0.4, -0.7], [-0.2, 0.1], [5.0, 5.0], [-5.0, 5.0]])
-    known = KnownActions(batch.next_obs, wanted, jnp.asarray([1.0, 1.0, 0.0, 0.0]))
+    known = sac.KnownActions(batch.next_obs, wanted, jnp.asarray([1.0, 1.0, 0.0, 0.0]))
 
     def step(i, state):
         return sac.update(jax.random.fold_in(jax.random.key(1), i), state, batch, config, known)[0]

@@ -20,7 +20,8 @@ def trace_once(
 
     Tracing the renderer or inverse kinematics takes seconds, and a program calls each in several places. `jax.jit`
     keeps the trace, and XLA inlines the calls, so the compiled program is the same. The platform is a part of the key,
-    because some functions choose block sizes by `jax.default_backend()`.
+    because some functions choose block sizes by `jax.default_backend()`. What else the function reads must not change;
+    who changes it in a test or a measurement calls `jax.clear_caches()`.
 
     Args:
       *static_names: names of the parameters that are not arrays. Their values must be hashable.

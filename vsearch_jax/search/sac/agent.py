@@ -9,7 +9,7 @@ halves the policy's final error.
 
 from __future__ import annotations
 
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +20,25 @@ from jax import Array
 
 from vsearch_jax.config import SACConfig
 from vsearch_jax.search.sac.networks import Actor, Critic, Value, apply_network, init_network
-from vsearch_jax.types import KnownActions, SACState, Transition
+from vsearch_jax.types import SACState, Transition
 
 _ACTION_SIZE = 2
 
 Params = TypeVar("Params", nnx.State, Array)
+
+
+class KnownActions(NamedTuple):
+    """Policy inputs for some of which the right action is known, because the target is within one step.
+
+    Attributes:
+      obs: f32[N, D], policy inputs.
+      action: f32[N, 2] in [-1, 1], the action that leads to the target. Meaningless where it is not known.
+      is_known: f32[N], 1 where the action is known, else 0.
+    """
+
+    obs: Array
+    action: Array
+    is_known: Array
 
 
 def init(key: Array, config: SACConfig, observation_size: int, action_size: int = _ACTION_SIZE) -> SACState:

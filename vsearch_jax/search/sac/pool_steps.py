@@ -13,7 +13,8 @@ from jax import Array
 from vsearch_jax.config import EnvConfig
 from vsearch_jax.env import step_reward
 from vsearch_jax.geometry import angle_difference, cosine_similarity, fold_into_band, view_from_uniform, wrap_angle
-from vsearch_jax.types import KnownActions, Observation, ReachabilityMap, Transition, View
+from vsearch_jax.search.sac.agent import KnownActions
+from vsearch_jax.types import Observation, ReachabilityMap, Transition, View
 
 _OWN_SHARE, _NEAR_SHARE = 1 / 3, 1 / 3
 """Shares of the targets that are the end of the step, and that are near it. The others are random views of the pool."""
