@@ -172,6 +172,19 @@ def test_readme_holds_the_results_of_the_committed_runs() -> None:
     assert text == script.with_sections(text, script.sections()), "run eval/readme_results.py"
 
 
+def test_the_dynamics_section_compares_both_evaluations_and_says_how_exactly_the_arm_moves() -> None:
+    script = load("eval/readme_results.py")
+    kinematic, dynamic = (json.loads((script.FOLDER / f"{name}.json").read_text()) for name in ("teapot", "plate"))
+    moves = {"planned": 499, "rest_error_micrometre_median": 1.25, "rest_error_micrometre_max": 3.75}
+    text = script.dynamics_section(kinematic, dynamic, moves)
+    row = next(line for line in text.splitlines() if line.startswith("| rotational error, mean"))
+    cells = [tuple(map(float, cell.split("/"))) for cell in row.strip("| ").split(" | ")[1:]]
+    wanted = [(kinematic[name]["rotation_error_deg_mean"], dynamic[name]["rotation_error_deg_mean"]) for name in LABELS]
+    np.testing.assert_allclose(cells, wanted, atol=0.005001)
+    assert "499 random moves" in text and "3.8 µm" in text
+    assert "random moves" not in script.dynamics_section(kinematic, dynamic, None)
+
+
 def test_each_part_is_closed_and_stands_on_the_table(tmp_path: Path) -> None:
     script = load("eval/parts.py")
     for name in script.PARTS:
