@@ -1,4 +1,4 @@
-"""Strips of pixels around faces: they hold every pixel that a face covers, and not many others."""
+"""Strips of pixels around faces hold every pixel that a face covers, and not many others; the queue holds all pairs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from vsearch_jax.render.geometry import pairs
 
@@ -27,7 +29,7 @@ def strips_of(corners: np.ndarray) -> tuple[list[set[tuple[int, int]]], np.ndarr
     first = np.cumsum(count) - count
     face = np.repeat(np.arange(len(corners)), count)
     own = jax.tree.map(lambda x: x[face], strips)
-    row, column, is_inside = pairs.pixels_of_pairs(own, jnp.asarray(first[face]), jnp.arange(len(face)))
+    row, column, is_inside = pairs.pixels_of_pairs(own, jnp.arange(len(face)) - first[face])
     pixels: list[set[tuple[int, int]]] = [set() for _ in corners]
     for f, r, c, inside in zip(face, np.asarray(row), np.asarray(column), np.asarray(is_inside), strict=True):
         if inside:
@@ -70,3 +72,29 @@ def test_a_strip_holds_every_pixel_that_its_face_covers(kind: str) -> None:
     assert (count <= rectangle).all()
     if kind == "long":
         assert count.sum() < 0.35 * rectangle.sum()
+
+
+@given(st.lists(st.sampled_from([0, 0, 1, 2, 63, 64, 65, 200]), min_size=1, max_size=80))
+def test_the_queue_gives_each_pair_once_and_in_order(counts: list[int]) -> None:
+    batch_size, zero = 64, jnp.int32(0)
+    queue = jax.jit(pairs.make_queue, static_argnums=1)(jnp.array(counts), batch_size)
+    take = jax.jit(pairs.next_pairs, static_argnums=2)
+    position, faces, ranks = pairs.Position(zero, zero), [], []
+    while position.entry < queue.length:
+        face, rank, is_pair, position = take(queue, position, batch_size, zero)
+        faces.extend(np.asarray(face)[np.asarray(is_pair)])
+        ranks.extend(np.asarray(rank)[np.asarray(is_pair)])
+        assert len(faces) == sum(counts) or len(faces) % batch_size == 0  # only the last batch is not full
+    np.testing.assert_array_equal(faces, np.repeat(np.arange(len(counts)), counts))
+    np.testing.assert_array_equal(ranks, [rank for count in counts for rank in range(count)])
+
+
+def test_a_queue_may_hold_more_pairs_than_31_bits_count() -> None:
+    huge, batch_size, zero = 2**30, 128, jnp.int32(0)
+    queue = pairs.make_queue(jnp.array([huge, huge, huge, 5]), batch_size)
+    position = pairs.Position(jnp.int32(1), jnp.int32(huge - 3))
+    face, rank, is_pair, position = pairs.next_pairs(queue, position, batch_size, zero)
+    np.testing.assert_array_equal(face, [1] * 3 + [2] * (batch_size - 3))
+    np.testing.assert_array_equal(rank, [huge - 3, huge - 2, huge - 1, *range(batch_size - 3)])
+    assert np.all(is_pair)
+    assert (int(position.entry), int(position.rank)) == (2, batch_size - 3)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -23,7 +21,6 @@ from oracles.render import (
     reached_by_light,
 )
 from vsearch_jax import render
-from vsearch_jax.render.geometry import rasterizer
 from vsearch_jax.render.geometry.triangles import compile_triangles
 
 SIZE = (48, 64)
@@ -86,22 +83,24 @@ def test_face_that_reaches_behind_the_camera_is_drawn() -> None:
     np.testing.assert_allclose(np.asarray(image.depth)[is_same], depth[is_same], rtol=1e-4)
 
 
-@pytest.fixture
-def few_pairs(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Lets the rasteriser count to 100 only. The renderer keeps its traces, so they are dropped before and after."""
-    jax.clear_caches()
-    monkeypatch.setattr(rasterizer, "_MAX_PAIRS", 100.0)
-    yield
-    jax.clear_caches()
-
-
-def test_depth_is_nan_if_there_are_too_many_pairs(few_pairs: None) -> None:
-    model = _mesh_model()
+def test_a_batch_of_different_images_equals_single_images() -> None:
+    """In a batch, the faces of all images share one queue: from afar a face has one pixel, from near a thousand."""
+    model = _mesh_model(light='<light type="directional" dir="-1 .3 -.6"/>')
     data = forward(model)
     frames, scene = poses(model, data), render.compile_scene(model)
     eye = render.camera(frames, model, "eye")
-    depth = jax.jit(lambda eye: render.render(scene, frames, eye, SIZE).depth)(eye)
-    assert np.isnan(depth).all()
+    heights = jnp.array([[1.2, 40.0, 2.5], [6.0, -3.0, 1.6]])  # below the mesh, the camera sees nothing
+
+    def draw(height: jax.Array) -> render.Image:
+        return render.render(scene, frames, eye.replace(position=eye.position.at[2].set(height)), SIZE)
+
+    images, draw_one = jax.jit(jax.vmap(jax.vmap(draw)))(heights), jax.jit(draw)
+    for index in np.ndindex(heights.shape):
+        single = draw_one(heights[index])
+        assert (np.asarray(single.geom_id) == 0).any() == (heights[index] > 0.0)
+        np.testing.assert_array_equal(images.geom_id[index], single.geom_id)
+        np.testing.assert_allclose(images.depth[index], single.depth, rtol=1e-5)
+        np.testing.assert_allclose(images.rgb[index], single.rgb, atol=1e-5)
 
 
 def test_normals_equal_mj_multi_ray() -> None:

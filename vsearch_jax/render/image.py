@@ -41,8 +41,11 @@ _CPU_TILE = (32, 64)
 # The rasteriser keeps the columns and rows of a face in 16 bits.
 _MAX_EDGE = 2**15 - 1
 
-_Tile: TypeAlias = "tuple[tuple[Array, Array], Raster | None]"
-"""One tile of the image: slopes of its rays, f32[1, w] and f32[h, 1], and its faces if the scene has any."""
+_Tile: TypeAlias = "tuple[tuple[Array, Array], Raster | trace.Hits | None]"
+"""One tile of the image: slopes of its rays, f32[1, w] and f32[h, 1]; and what is known of its pixels, if anything.
+
+That is the nearest face, or the geom that each pixel shows.
+"""
 
 
 class _ImageContext(NamedTuple):
@@ -88,8 +91,7 @@ def render(scene: RenderScene, data: GeomPoses, camera: Camera, size: tuple[int,
     Returns:
       Colour rgb f32[H, W, 3] in [0, 1]. Depth f32[H, W] m along the optical axis, +inf where the ray hits nothing.
       Number of the geom that is seen, geom_id i32[H, W], -1 on a miss. Surface normal f32[H, W, 3], unit vectors in
-      world, 0 on a miss. Under jit, fields that are not used cost nothing. If the meshes have more (face, pixel) pairs
-      than 31 bits can count, the depth is NaN in every pixel.
+      world, 0 on a miss. Under jit, fields that are not used cost nothing.
 
     Raises:
       RenderError: height or width is not from 1 to 32,767.
@@ -115,8 +117,12 @@ def _draw(scene: RenderScene, frames: trace.Frames, lights: LightPoses, camera: 
     if scene.triangles is not None:
         whole = _rasterize_faces(fixed_scene, fixed_frames, fixed_pixels, size, zero)
         raster = Raster(tiling.split(whole.depth), tiling.split(whole.face))
-    tiles = (tiling.split_axes(*rays), raster)
-    shadows = _cast_shadow_maps(fixed_scene, fixed_frames, fixed_lights, tiles, zero)
+    tiles: _Tile = (tiling.split_axes(*rays), raster)
+    shadows: dict[int, ShadowMap] = {}
+    if needs_shadow_maps(scene):
+        hits = jax.lax.map(functools.partial(_nearest_hits, fixed_scene, fixed_frames), jax.lax.stop_gradient(tiles))
+        shadows = _cast_shadow_maps(fixed_scene, fixed_frames, fixed_lights, (tiles[0], hits), zero)
+        tiles = (tiles[0], hits)
     context = _ImageContext(frames, rotation, lights, shadows, zero)
     images = jax.lax.map(functools.partial(_render_tile, scene, context), tiles)
     return jax.tree.map(tiling.join, images)
@@ -191,21 +197,24 @@ def _choose_tiling(size: tuple[int, int]) -> Tiling:
 
 
 def _cast_shadow_maps(
-    scene: RenderScene, frames: trace.Frames, lights: LightPoses, tiles: _Tile, zero: Array
+    scene: RenderScene,
+    frames: trace.Frames,
+    lights: LightPoses,
+    tiles: tuple[tuple[Array, Array], trace.Hits],
+    zero: Array,
 ) -> dict[int, ShadowMap]:
     """Returns the shadow maps of all lights that need one; the arrays of `tiles` have a leading axis of tiles."""
-    if not needs_shadow_maps(scene):
-        return {}
-    (x, y), _ = fixed_tiles = jax.lax.stop_gradient(tiles)
-    hits = jax.lax.map(functools.partial(_nearest_hits, scene, frames), fixed_tiles)
+    (x, y), hits = jax.lax.stop_gradient(tiles)
     seen = (x * hits.depth, y * hits.depth, -hits.depth), hits.is_hit
     return shadow_maps(scene, frames, lights, seen, zero)
 
 
 def _nearest_hits(scene: RenderScene, frames: trace.Frames, tile: _Tile) -> trace.Hits:
-    rays, raster = tile
+    rays, known = tile
+    if isinstance(known, trace.Hits):
+        return known
     hits = trace.nearest_primitives(scene, frames, *rays)
-    return hits if raster is None else trace.merge_raster(scene, hits, raster)
+    return hits if known is None else trace.merge_raster(scene, hits, known)
 
 
 def _render_tile(scene: RenderScene, context: _ImageContext, tile: _Tile) -> Image:

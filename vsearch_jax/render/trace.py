@@ -189,10 +189,10 @@ def merge_raster(scene: RenderScene, hits: Hits, raster: Raster) -> Hits:
     Args:
       scene: the compiled scene, with meshes or height fields.
       hits: nearest primitive of each pixel.
-      raster: nearest triangle of each pixel. A triangle with a depth of NaN counts as nearer, so the NaN is visible.
+      raster: nearest triangle of each pixel.
     """
     assert scene.triangles is not None
-    is_nearer = ~(raster.depth >= jnp.where(hits.is_hit, hits.depth, jnp.inf))
+    is_nearer = raster.depth < jnp.where(hits.is_hit, hits.depth, jnp.inf)
     geom = scene.triangles.geom.at[raster.face].get(mode="promise_in_bounds")
     return Hits(
         jnp.where(is_nearer, scene.num_primitives + geom, hits.slot),

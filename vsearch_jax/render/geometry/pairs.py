@@ -1,8 +1,10 @@
-"""Numbers for all pairs (face, pixel of the face's strip), and the way back from a number to its pair.
+"""A queue of all pairs (face, pixel of the face's strip), from which a loop takes a fixed number of pairs at a time.
 
-Face 0 owns the first numbers, face 1 the next ones, and so on. Within a face, pixels are counted row by row. Each row
-of a strip has the same number of pixels, and begins at the left edge of the face. So the strip of a long, slanted face
-is narrow, although the rectangle around the face is large.
+The pairs of the first face come first, then those of the second one, and so on. Within a face, pixels are counted row
+by row. Each row of a strip has the same number of pixels, and begins at the left edge of the face. So the strip of a
+long, slanted face is narrow, although the rectangle around the face is large.
+
+No number counts the pairs of all faces together, so their number has no limit.
 """
 
 from __future__ import annotations
@@ -43,18 +45,30 @@ class Strips(NamedTuple):
     slopes: tuple[Array, Array]
 
 
-class Pairs(NamedTuple):
-    """The strips of T faces, and the numbers of the face's pairs (face, pixel of its strip).
+class Queue(NamedTuple):
+    """The faces that have pairs, in ascending order. E is the number of all faces plus the size of a batch.
 
     Attributes:
-      strips: Strips.
-      first: i32[T], number of the face's first pair.
-      stop: i32[T], number of the face's last pair plus 1.
+      face: i32[E], number of the face of each entry; meaningless from entry `length` on.
+      count: i32[E], number of pairs of the face; 0 from entry `length` on.
+      length: i32[], number of entries.
     """
 
-    strips: Strips
-    first: Array
-    stop: Array
+    face: Array
+    count: Array
+    length: Array
+
+
+class Position(NamedTuple):
+    """A place in the queue: the next pair is pair number `rank` of the face of entry `entry`.
+
+    Attributes:
+      entry: i32[].
+      rank: i32[].
+    """
+
+    entry: Array
+    rank: Array
 
 
 # Elementwise, and not `jnp.min` of a stack: XLA on CPU is slow on an axis of length 3.
@@ -116,31 +130,60 @@ def count_pairs(strips: Strips) -> Array:
     return strips.width * ((strips.rows >> 16) - (strips.rows & 0xFFFF))
 
 
-def faces_of_pairs(pairs: Pairs, start: Array, batch_size: int, zero: Array) -> Array:
-    """Returns the face of each pair (face, pixel of its strip) in a batch of pairs with consecutive numbers.
+def make_queue(count: Array, batch_size: int) -> Queue:
+    """Returns the queue of all pairs (face, pixel of its strip).
 
     Args:
-      pairs: strip of each face, and numbers of the pairs of each face.
-      start: i32[], number of the first pair of the batch.
-      batch_size: number of pairs B in the batch, a multiple of 64; static.
+      count: i32[T], number of pairs of each face; see `count_pairs`.
+      batch_size: number of pairs that `next_pairs` takes at a time, static.
+    """
+    num_faces = count.shape[0]
+    has_pairs = count > 0
+    entry = jnp.cumsum(has_pairs, dtype=jnp.int32) - 1
+    slot = jnp.where(has_pairs, entry, num_faces + batch_size)
+    empty = jnp.zeros(num_faces + batch_size, jnp.int32)
+    face = empty.at[slot].set(jnp.arange(num_faces, dtype=jnp.int32), mode="drop")
+    return Queue(face, empty.at[slot].set(count, mode="drop"), entry[-1] + 1)
+
+
+def next_pairs(queue: Queue, position: Position, batch_size: int, zero: Array) -> tuple[Array, Array, Array, Position]:
+    """Takes the next B pairs (face, pixel of its strip) from the queue.
+
+    Args:
+      queue: the queue, made for batches of B pairs.
+      position: where the batch begins.
+      batch_size: number of pairs B in the batch, a multiple of 64 and at most 2^22; static.
       zero: i32[], a 0 that the compiler does not know to be 0. It keeps XLA from computing results twice.
 
     Returns:
-      Number of each pair's face, i32[B]. A number after the last pair gets the last face that begins before it.
+      Face of each pair, i32[B]. Number of the pair within its face, i32[B]. Whether there is a pair, bool[B]: after the
+      end of the queue there is none. Position of the next batch.
     """
-    marks = materialize(_mark_first_pairs(pairs, start, batch_size), zero)
-    return materialize(_running_maximum(marks), zero)
+    # Each entry has a pair, so the next B entries hold the next B pairs.
+    face, count = (jax.lax.dynamic_slice(x, (position.entry,), (batch_size,)) for x in (queue.face, queue.count))
+    left = jnp.minimum(count.at[0].add(-position.rank), batch_size + 1)
+    # The sum in f32 cannot overflow, and is exact up to 2^24. What lies beyond B only has to be larger than B.
+    total = jnp.minimum(materialize(_running_sum(left.astype(jnp.float32)), zero), 2.0 * batch_size + 1.0)
+    stop = total.astype(jnp.int32)
+    first = (stop - left).at[0].set(-position.rank)
+    slot = jnp.where((left > 0) & (stop - left < batch_size), stop - left, batch_size)
+    index = jnp.arange(batch_size, dtype=jnp.int32)
+    marks = materialize(jnp.zeros(batch_size, jnp.int32).at[slot].max(index, mode="drop"), zero)
+    entry = materialize(_running_maximum(marks), zero)
+    face, first_of_face = (x.at[entry].get(mode="promise_in_bounds") for x in (face, first))
+    num_done = jnp.sum(stop <= batch_size, dtype=jnp.int32)
+    # The face after the last one that is done has given some pairs, or none.
+    rank = batch_size - first[jnp.minimum(num_done, batch_size - 1)]
+    new = Position(position.entry + num_done, jnp.where(num_done < batch_size, rank, 0))
+    return face, index - first_of_face, index < stop[-1], new
 
 
-def _mark_first_pairs(pairs: Pairs, start: Array, batch_size: int) -> Array:
-    """Returns i32[B]: at the first pair of each face that face, and elsewhere the face of pair number `start`."""
-    num_faces = pairs.first.shape[0]
-    offset = pairs.first - start
-    # A face without pairs has the same first number as the next face. The maximum keeps the next face.
-    slot = jnp.where((offset >= 0) & (offset < batch_size), offset, batch_size)
-    face_at_start = jnp.minimum(jnp.sum(pairs.stop <= start), num_faces - 1).astype(jnp.int32)
-    marks = jnp.full(batch_size, face_at_start, jnp.int32)
-    return marks.at[slot].max(jnp.arange(num_faces, dtype=jnp.int32), mode="drop")
+def _running_sum(values: Array) -> Array:
+    """Returns f32[B], the sum of `values` (f32[B]) up to each position."""
+    # First within blocks of 64, then over the blocks: XLA's own running sum is slow on long arrays.
+    blocks = jnp.cumsum(values.reshape(-1, 64), axis=1)
+    last = jnp.cumsum(blocks[:, -1])
+    return (blocks + (last - blocks[:, -1])[:, None]).reshape(-1)
 
 
 def _running_maximum(values: Array) -> Array:
@@ -152,20 +195,18 @@ def _running_maximum(values: Array) -> Array:
     return jnp.maximum(blocks, before[:, None]).reshape(-1)
 
 
-def pixels_of_pairs(strips: Strips, first: Array, number: Array) -> tuple[Array, Array, Array]:
+def pixels_of_pairs(strips: Strips, rank: Array) -> tuple[Array, Array, Array]:
     """Returns the pixel of each of B pairs (face, pixel of its strip).
 
     Args:
       strips: the strip of each pair's face, arrays of B.
-      first: i32[B], number of the first pair of that face.
-      number: i32[B], number of the pair.
+      rank: i32[B], number of the pair within its face.
 
     Returns:
       Row i32[B] and column i32[B] of the pixel; and bool[B], whether the pixel lies in the face's rectangle.
     """
     first_column, first_row = strips.columns & 0xFFFF, strips.rows & 0xFFFF
     width = jnp.maximum(strips.width, 1)
-    rank = number - first
     # XLA vectorises the division of floats, but not that of integers. The second line corrects the rounding.
     row = jnp.floor((rank.astype(jnp.float32) + 0.5) / width.astype(jnp.float32)).astype(jnp.int32)
     row = row + jnp.where(rank < row * width, -1, jnp.where(rank >= (row + 1) * width, 1, 0))

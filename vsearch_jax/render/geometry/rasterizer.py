@@ -3,12 +3,11 @@
 A visible face of a mesh covers only a few pixels. So it is cheaper to find the pixels of each face than to find the
 face of each ray. The algorithm has three steps:
 
-1. `_bounding_strips` projects the corners of every face, and returns a strip of pixels that holds the face. The strip
-   of a long, slanted face is narrow; CAD programs make many such faces. Faces outside the image and culled faces get an
+1. `_project_faces` projects the corners of every face, and finds a strip of pixels that holds the face. The strip of a
+   long, slanted face is narrow; CAD programs make many such faces. Faces outside the image and culled faces get an
    empty strip.
-2. All pairs (face, pixel of its strip) are numbered; see `render.geometry.pairs`. A loop takes a batch of consecutive
-   numbers at a time, and recovers from each number the face (a scatter of the faces' first numbers, then a running
-   maximum) and the pixel (the pair's rank within its face).
+2. The pairs (face, pixel of its strip) of all faces form one long queue; see `render.geometry.pairs`. A loop takes the
+   next pairs from the queue, a fixed number at a time.
 3. For each pair, the ray through the pixel's centre is tested against the face. The nearest hit of each pixel is kept
    (a depth buffer, by a scatter of minima).
 
@@ -17,7 +16,8 @@ sheared so that the ray becomes the z axis, then the signs of three areas tell o
 Two faces that share an edge compute the area of that edge from the same numbers, so no ray slips between them.
 
 Step 1 costs a few passes over the faces. Steps 2 and 3 cost as much as there are pairs, and that number depends on the
-image more than on the number of faces.
+image more than on the number of faces. Under `vmap` the faces of all images share one queue. With a queue for each
+image, all images would pay for the image with the most pairs.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.render.geometry.pairs import (
-    Pairs,
+    Position,
     Strips,
     count_pairs,
-    faces_of_pairs,
+    make_queue,
     max_of_three,
     min_of_three,
     narrow_strips,
+    next_pairs,
     pixels_of_pairs,
 )
 from vsearch_jax.render.geometry.triangles import Triangles
-from vsearch_jax.xla.materialize import materialize
+from vsearch_jax.xla.batching import flatten_vmap
+from vsearch_jax.xla.materialize import materialize, runtime_zero
 from vsearch_jax.xla.vectors import Vector
 
 # m. A face that comes closer than this to the plane of the viewer is not projected; it is tested in all pixels.
 _NEAR = 1e-6
 # Pixels. Rectangles grow by this, which is far more than the rounding error of a projected corner.
 _MARGIN = 1e-3
-# Pairs (face, pixel) that are tested at a time.
-_BATCH = 4096
-# Largest number of pairs. It is below 2^31 by more than the rounding error of the sum in f32 that counts them.
-_MAX_PAIRS = 2.1e9
+# Pairs (face, pixel) that are tested at a time: for each image, and at most, on a CPU and on other platforms.
+_BATCH, _MAX_CPU_BATCH, _MAX_BATCH = 4096, 16384, 2**20
 
 
 class Pinhole(NamedTuple):
@@ -82,6 +82,24 @@ class Raster(NamedTuple):
 
     depth: Array
     face: Array
+
+
+class _Faces(NamedTuple):
+    """T faces as a view sees them. (column, row) = (x / w, y / w) are the pixels of a corner in front of the viewer.
+
+    Attributes:
+      strips: the pixels that may show each face.
+      x: f32[T] for each of three corners.
+      y: f32[T] for each of three corners.
+      w: f32[T] for each of three corners; 1 in a parallel view, else the depth in m.
+      depth: f32[T] m for each of three corners. Empty in a perspective view, where w is the depth.
+    """
+
+    strips: Strips
+    x: tuple[Array, ...]
+    y: tuple[Array, ...]
+    w: tuple[Array, ...]
+    depth: tuple[Array, ...]
 
 
 class Projection(NamedTuple):
@@ -157,86 +175,90 @@ def _is_front(x: list[Array], y: list[Array], w: list[Array]) -> Array:
     return (area > 0.0) | (min_of_three(w) <= _NEAR)
 
 
-def _bounding_strips(triangles: Triangles, projection: Projection, size: tuple[int, int], zero: Array) -> Strips:
-    """Returns the strip that holds each face."""
+def _project_faces(triangles: Triangles, projection: Projection, size: tuple[int, int], zero: Array) -> _Faces:
+    """Returns the corners of each face in pixels, and the strip that holds the face."""
     pose = _rows_of_faces(projection.pose, triangles.geom)
     points = [(corner[0], corner[1], corner[2]) for corner in triangles.corners]
     corners = (_to_view(projection, pose, point) for point in points)
-    x, y, w, _ = (list(values) for values in zip(*corners, strict=True))
-    pinhole = projection.pinhole
+    x, y, w, depth = (list(values) for values in zip(*corners, strict=True))
+    is_front, pinhole = _is_front(x, y, w), projection.pinhole
+    y = [-a for a in y]  # rows count downwards
     columns = _pixel_interval(x, w, pinhole.scale_x, pinhole.center_x, size[1])
-    rows = _pixel_interval([-a for a in y], w, pinhole.scale_y, pinhole.center_y, size[0])
+    rows = _pixel_interval(y, w, pinhole.scale_y, pinhole.center_y, size[0])
     is_culled = _rows_of_faces(projection.is_culled[None], triangles.geom)[0]
-    rows = jnp.where((is_culled > 0.0) & ~_is_front(x, y, w), 0, rows)
+    rows = jnp.where((is_culled > 0.0) & ~is_front, 0, rows)
     u = _to_pixels(x, w, pinhole.scale_x, pinhole.center_x)
-    v = _to_pixels([-a for a in y], w, pinhole.scale_y, pinhole.center_y)
-    return materialize(narrow_strips(u, v, min_of_three(w) > _NEAR, columns, rows), zero)
+    v = _to_pixels(y, w, pinhole.scale_y, pinhole.center_y)
+    strips = narrow_strips(u, v, min_of_three(w) > _NEAR, columns, rows)
+    faces = _Faces(
+        strips,
+        tuple(pinhole.scale_x * a + pinhole.center_x * b for a, b in zip(x, w, strict=True)),
+        tuple(pinhole.scale_y * a + pinhole.center_y * b for a, b in zip(y, w, strict=True)),
+        tuple(w),
+        tuple(depth) if projection.is_parallel else (),
+    )
+    return materialize(faces, zero)
 
 
-def _depth_of_hits(
-    triangles: Triangles, projection: Projection, face: Array, pixel: tuple[Array, Array], zero: Array
-) -> Array:
+def _depth_of_hits(faces: _Faces, row: Array, column: Array) -> Array:
     """Returns the depth at which rays meet faces (Woop et al. 2013; see the module's docstring).
 
     Args:
-      triangles: Triangles.
-      projection: Projection.
-      face: i32[N].
-      pixel: f32[N] column and f32[N] row of the pixels whose rays are tested.
-      zero: see `materialize`.
+      faces: N faces.
+      row: f32[N], row of the pixel whose ray is tested against each face.
+      column: f32[N], column of that pixel.
 
     Returns:
       f32[N] m; +inf where the ray of a pixel misses the face.
     """
-    pinhole = projection.pinhole
-    ray_x = (pixel[0] - pinhole.center_x) / pinhole.scale_x
-    ray_y = (pinhole.center_y - pixel[1]) / pinhole.scale_y
-    table = triangles.corners.reshape(9, -1)
-    axes = materialize([_take(row, face) for row in table], zero)
-    geom = face if projection.pose.shape[1] == 1 else materialize(_take(triangles.geom, face), zero)
-    pose = _rows_of_faces(projection.pose, geom)
-    x: list[Array] = []
-    y: list[Array] = []
-    depth: list[Array] = []
-    for i in (0, 3, 6):
-        corner_x, corner_y, w, corner_depth = _to_view(projection, pose, (axes[i], axes[i + 1], axes[i + 2]))
-        x.append(corner_x - ray_x * w)
-        y.append(corner_y - ray_y * w)
-        depth.append(corner_depth)
-    areas = [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
+    x = [a - column * b for a, b in zip(faces.x, faces.w, strict=True)]
+    y = [a - row * b for a, b in zip(faces.y, faces.w, strict=True)]
+    depth = faces.depth or faces.w
+    products = [(x[i] * y[j], x[j] * y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
+    areas = [a - b for a, b in products]
     total = areas[0] + areas[1] + areas[2]
     hit_depth = (areas[0] * depth[0] + areas[1] * depth[1] + areas[2] * depth[2]) / jnp.where(total == 0.0, 1.0, total)
-    is_inside = ((min_of_three(areas) >= 0.0) | (max_of_three(areas) <= 0.0)) & (total != 0.0)
-    return jnp.where(is_inside & (projection.is_parallel | (hit_depth > 0.0)), hit_depth, jnp.inf)
+    # The products are compared, because a fused multiply-subtract rounds one of them only: on an edge that two faces
+    # share, both areas could be negative, and the ray would slip between the faces.
+    is_left, is_right = ([compare(a, b) for a, b in products] for compare in (jnp.greater_equal, jnp.less_equal))
+    is_inside = ((is_left[0] & is_left[1] & is_left[2]) | (is_right[0] & is_right[1] & is_right[2])) & (total != 0.0)
+    is_parallel = bool(faces.depth)
+    return jnp.where(is_inside & (is_parallel | (hit_depth > 0.0)), hit_depth, jnp.inf)
 
 
-def _has_pairs_left(pairs: Pairs, state: tuple[Array, Array, Array]) -> Array:
-    return state[0] < pairs.stop[-1]
+def _draw_images(size: tuple[int, int], _: tuple[()], faces: _Faces) -> Raster:
+    """Returns the nearest face of each pixel of N images.
 
+    Args:
+      size: height and width of an image in pixels.
+      _: nothing; `flatten_vmap` calls it so.
+      faces: the faces of each image: arrays [N, T].
+    """
+    num_images, num_faces = faces.strips.rows.shape
+    num_pixels = size[0] * size[1]
+    batch_size = min(_BATCH * num_images, _MAX_CPU_BATCH if jax.default_backend() == "cpu" else _MAX_BATCH)
+    zero = runtime_zero(faces.w[0][:, :1])
+    flat: _Faces = jax.tree.map(lambda x: x.reshape(-1), faces)
+    queue = materialize(make_queue(count_pairs(flat.strips), batch_size), zero)
 
-def _test_batch(
-    triangles: Triangles,
-    projection: Projection,
-    pairs: Pairs,
-    context: tuple[tuple[int, int], Array],
-    state: tuple[Array, Array, Array],
-) -> tuple[Array, Array, Array]:
-    """Tests the next batch of pairs. The state holds the next pair's number, and depth and face of each pixel."""
-    (height, width), zero = context
-    start, best, faces = state
-    num_pixels = height * width
-    face = faces_of_pairs(pairs, start, _BATCH, zero)
-    strips, first = materialize(jax.tree.map(lambda t: _take(t, face), (pairs.strips, pairs.first)), zero)
-    number = start + jnp.arange(_BATCH, dtype=jnp.int32)
-    row, column, is_inside = materialize(pixels_of_pairs(strips, first, number), zero)
-    pixel = (column.astype(jnp.float32), row.astype(jnp.float32))
-    depth = materialize(_depth_of_hits(triangles, projection, face, pixel, zero), zero)
-    is_hit = is_inside & (number < pairs.stop[-1]) & (depth < jnp.inf)
-    target = materialize(jnp.where(is_hit, row * width + column, num_pixels), zero)
-    best = best.at[target].min(depth, mode="drop")
-    is_best = depth <= _take(best, jnp.minimum(target, num_pixels - 1))
-    faces = faces.at[jnp.where(is_best, target, num_pixels)].set(face, mode="drop")
-    return start + _BATCH, best, faces
+    def test_batch(state: tuple[Position, Array, Array]) -> tuple[Position, Array, Array]:
+        position, best, nearest = state
+        face, rank, is_pair, position = next_pairs(queue, position, batch_size, zero)
+        own: _Faces = materialize(jax.tree.map(lambda table: _take(table, face), flat), zero)
+        row, column, is_inside = materialize(pixels_of_pairs(own.strips, rank), zero)
+        depth = materialize(_depth_of_hits(own, row.astype(jnp.float32), column.astype(jnp.float32)), zero)
+        pixel = (face // num_faces) * num_pixels + row * size[1] + column
+        target = jnp.where(is_pair & is_inside & (depth < jnp.inf), pixel, num_images * num_pixels)
+        target = materialize(target, zero)
+        best = best.at[target].min(depth, mode="drop")
+        is_nearest = depth <= _take(best, jnp.minimum(target, num_images * num_pixels - 1))
+        target = jnp.where(is_nearest, target, num_images * num_pixels)
+        return position, best, nearest.at[target].set(face % num_faces, mode="drop")
+
+    none = jnp.full(num_images * num_pixels, jnp.inf, jnp.float32), jnp.zeros(num_images * num_pixels, jnp.int32)
+    initial = (Position(jnp.zeros_like(zero), jnp.zeros_like(zero)), *none)
+    _, depth, nearest = jax.lax.while_loop(lambda state: state[0].entry < queue.length, test_batch, initial)
+    return Raster(depth.reshape(num_images, *size), nearest.reshape(num_images, *size))
 
 
 def rasterize(triangles: Triangles, projection: Projection, size: tuple[int, int], zero: Array) -> Raster:
@@ -249,16 +271,8 @@ def rasterize(triangles: Triangles, projection: Projection, size: tuple[int, int
       zero: i32[], a 0 that the compiler does not know to be 0. It keeps XLA from computing results twice.
 
     Returns:
-      Nearest face and depth of each pixel. All depths are NaN if there are more than about 2^31 pairs of a face and a
-      pixel of its strip.
+      Nearest face and depth of each pixel.
     """
-    strips = _bounding_strips(triangles, projection, size, zero)
-    count = count_pairs(strips)
-    stop = materialize(jnp.cumsum(count), zero)
-    pairs = Pairs(strips, materialize(stop - count, zero), stop)
-    num_pixels = size[0] * size[1]
-    initial = (jnp.zeros_like(zero), jnp.full(num_pixels, jnp.inf, jnp.float32), jnp.zeros(num_pixels, jnp.int32))
-    step = functools.partial(_test_batch, triangles, projection, pairs, (size, zero))
-    _, depth, face = jax.lax.while_loop(functools.partial(_has_pairs_left, pairs), step, initial)
-    depth = jnp.where(jnp.sum(count.astype(jnp.float32)) < _MAX_PAIRS, depth, jnp.nan)
-    return Raster(depth.reshape(size), face.reshape(size))
+    faces = _project_faces(triangles, projection, size, zero)
+    draw = flatten_vmap(functools.partial(_draw_images, size))
+    return jax.tree.map(lambda x: x[0], draw((), jax.tree.map(lambda x: x[None], faces)))
