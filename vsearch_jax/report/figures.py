@@ -171,7 +171,7 @@ def draw_policy_episodes(trials: Trials) -> Figure:
       trials: measures of `sac` from `evaluate`, arrays of [policy seeds, episodes].
     """
     steps, bound = trials["evaluations"].ravel(), trials["steps_lower_bound"].ravel()
-    figure = Figure(figsize=(10, 3.6))
+    figure = Figure(figsize=(10, 4.0))
     counts, rotation, translation = figure.subplots(1, 3, width_ratios=(1.6, 1, 1))
     numbers = np.arange(1, max(steps.max(), bound.max()) + 1)
     share = [100.0 * np.bincount(x, minlength=numbers[-1] + 1)[1:] / x.size for x in (steps, bound)]
@@ -179,9 +179,9 @@ def draw_policy_episodes(trials: Trials) -> Figure:
     counts.bar(numbers + 0.2, share[1], 0.4, color="#b9d8cd", label=f"lower bound, mean {bound.mean():.2f}")
     thesis_mean = _thesis_mean("evaluations_mean")
     counts.axvline(thesis_mean, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis_mean:g}")
-    title = f"{steps.size} episodes, random views and targets"
-    counts.set(xlabel="steps of an episode", ylabel="episodes (%)", title=title)
-    counts.legend(loc="upper right")
+    figure.suptitle(f"{steps.size} episodes, random views and targets", x=0.01, ha="left")
+    counts.set(xlabel="steps of an episode", ylabel="episodes (%)")
+    _legend_above(counts)
     degrees, centimetres = np.rad2deg(trials["rotation_error"]).ravel(), 100 * trials["translation_error"].ravel()
     _plot_errors(rotation, degrees, "rotational error (°)", "°", _thesis_mean("rotation_error_deg_mean"))
     thesis_mean = _thesis_mean("translation_error_cm_mean")
@@ -203,8 +203,13 @@ def _plot_errors(axes: Axes, errors: np.ndarray, label: str, unit: str, thesis_m
     median = np.median(errors)
     axes.axvline(float(median), color=INK, linewidth=1.2, label=f"median {median:.2f}{unit}")
     axes.axvline(thesis_mean, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis_mean:g}{unit}")
-    axes.set(xlabel=label, ylabel="episodes (%)")
-    axes.legend(loc="upper right")
+    axes.set(xlabel=f"{label}\nlast bar: all larger errors", ylabel="episodes (%)")
+    _legend_above(axes)
+
+
+def _legend_above(axes: Axes) -> None:
+    """Puts the legend above the plot, where it hides no bar."""
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)
 
 
 @styled
