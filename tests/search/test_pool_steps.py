@@ -105,6 +105,9 @@ def test_known_actions_lead_to_every_target_within_one_step_and_only_to_those():
     start = obs[:, -1].astype(int)
     target = np.argmin(np.linalg.norm(np.asarray(pool.code)[None] - obs[:, None, 16:32], axis=-1), axis=-1)
     change = change_deg(degrees, start, target)
+    # The action ends one degree inside the band.
+    change[:, 1] = np.clip(degrees[target, 1], 41.0, 69.0) - degrees[start, 1]
+    assert (np.abs(degrees[target, 1] - 55.0) > 14.0).any()
     np.testing.assert_array_equal(is_known, np.abs(change).max(axis=-1) <= CONFIG.action_scale_deg)
     assert 0.5 < is_known.mean() < 0.9
     np.testing.assert_allclose(action * CONFIG.action_scale_deg, change, atol=2e-3)

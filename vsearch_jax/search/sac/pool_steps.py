@@ -20,8 +20,8 @@ _OWN_SHARE, _NEAR_SHARE = 1 / 3, 1 / 3
 """Shares of the targets that are the end of the step, and that are near it. The others are random views of the pool."""
 _NEAR_DEG = 5.0
 """Standard deviation of near targets about the end of the step, in azimuth and elevation."""
-
-
+_EDGE_MARGIN_DEG = 1.0
+"""Known actions end this far inside the band. A policy that is off by less then still commands a reachable view."""
 _BEYOND_SHARE = 1 / 3
 """Share of the steps whose elevation is not folded into the band."""
 _CELL_AZIMUTHS, _CELL_ELEVATIONS = 256, 32
@@ -72,7 +72,8 @@ def sample_pool_steps(
     policy what misses the threshold by little. The arm's joints before and after the step are unrelated.
 
     The views are known, so the action that leads from the start straight to the target is known too if one step is
-    enough.
+    enough. It stops 1 degree before the edge of the band: a view beyond the edge is unreachable, and the policy would
+    command it again and again.
 
     Args:
       key: PRNG key.
@@ -93,7 +94,7 @@ def sample_pool_steps(
     end = jnp.where(is_reachable, _neighbours(indexed, commanded), start)
     action = jnp.where(is_reachable, jnp.clip(_change(pool.view, start, end) / scale, -1.0, 1.0), wanted)
     targets = _targets(target_key, indexed, end)
-    target, straight = pool.code[targets], _change(pool.view, start, targets) / scale
+    target, straight = pool.code[targets], _straight_change(indexed, start, targets) / scale
     is_known = jnp.max(jnp.abs(straight), axis=0) <= 1.0
     reward, is_found = step_reward(cosine_similarity(pool.code[end], target), is_reachable, config)
     obs, next_obs = (jnp.concatenate([pool.code[i], target, pool.qpos[i]], axis=-1) for i in (start, end))
@@ -112,6 +113,14 @@ def _change(views: View, start: Array, end: Array) -> Array:
     """Returns f32[2, N] rad, the changes of azimuth and elevation between views with the indices `start` and `end`."""
     azimuth = angle_difference(views.azimuth[end], views.azimuth[start])
     return jnp.stack([azimuth, views.elevation[end] - views.elevation[start]])
+
+
+def _straight_change(indexed: IndexedPool, start: Array, target: Array) -> Array:
+    """Returns f32[2, N] rad, the changes of azimuth and elevation that lead to the targets, inside the band's edges."""
+    views, (low, high) = indexed.observations.view, indexed.reach.band
+    margin = jnp.minimum(math.radians(_EDGE_MARGIN_DEG), 0.5 * (high - low))
+    elevation = jnp.clip(views.elevation[target], low + margin, high - margin)
+    return jnp.stack([_change(views, start, target)[0], elevation - views.elevation[start]])
 
 
 def _may_be_reachable(reach: ReachabilityMap, view: View) -> Array:
