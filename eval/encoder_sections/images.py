@@ -143,7 +143,7 @@ def _encode(env: vs.ViewSearchEnv, joints_key: Array, item: tuple[Array, View, A
     _, qpos, _ = env.resolve_view(view, wanted, jnp.bool_(False))
     data, camera = env.forward(qpos)
 
-    lit = encoders.randomize_lights(light_key, env.render_scene, env.center)
+    lit = encoders.randomize_lights(light_key, env.render_scene, env.center, camera)
     scene = tree_where(kind == DISTURBANCES.index("light"), lit, env.render_scene)
     moved = encoders.jitter_camera(camera_key, camera)
     seen = tree_where(kind == DISTURBANCES.index("shift"), moved, camera)

@@ -18,6 +18,7 @@ from vsearch_jax import encoder as encoders
 from vsearch_jax.config import PRESETS, Config, ConfigError, EncoderConfig
 from vsearch_jax.encoder import augment, fit, network
 from vsearch_jax.render import compile_scene
+from vsearch_jax.render.scene import Lights, RenderScene
 from vsearch_jax.types import Camera, Image
 
 INPUTS = ("rgb", "depth", "silhouette")
@@ -230,10 +231,17 @@ def test_colour_matrix_keeps_grey_and_limits_the_hue():
     assert cosine.min() < np.cos(0.8 * augment._MAX_HUE)
 
 
-def test_random_lights_keep_their_distance_and_shine_at_the_centre_from_above():
+def _random_lights(scene: RenderScene, count: int) -> Lights:
+    keys = jax.random.split(jax.random.key(0), count)
+    camera = Camera(position=CENTER + jnp.array([0.3, 0.0, 0.1]), rotation=jnp.eye(3), fovy=jnp.float32(0.6))
+    randomize = functools.partial(encoders.randomize_lights, scene=scene, center=jnp.asarray(CENTER), camera=camera)
+    return jax.jit(jax.vmap(randomize))(keys).lights
+
+
+def test_random_lights_keep_their_distance_and_shine_at_the_centre_from_above(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(augment, "_SHADOW_PROBABILITY", 0.0)
     scene = compile_scene(mujoco.MjModel.from_xml_string(LIT_MODEL))
-    keys = jax.random.split(jax.random.key(0), 50)
-    lights = jax.vmap(encoders.randomize_lights, in_axes=(0, None, None))(keys, scene, CENTER).lights
+    lights = _random_lights(scene, 50)
     offset = np.asarray(lights.position) - CENTER
     distance = np.linalg.norm(offset, axis=-1)
     np.testing.assert_allclose(
@@ -246,6 +254,19 @@ def test_random_lights_keep_their_distance_and_shine_at_the_centre_from_above():
     assert abs(height.mean() - 0.75) < 0.06  # Over the cap, the height is uniform from 1/2 to 1.
     ratio = np.asarray(lights.diffuse) / np.asarray(scene.lights.diffuse)
     assert np.all((ratio > 0.4 * 0.85 - 1e-5) & (ratio < 1.3 * 1.15 + 1e-5))
+
+
+def test_half_of_the_images_are_lit_from_behind_the_camera_and_above_the_table():
+    scene = compile_scene(mujoco.MjModel.from_xml_string(LIT_MODEL))
+    lights = _random_lights(scene, 400)
+    offset = np.asarray(lights.position) - CENTER
+    assert np.all(offset[..., 2] > 0.0)
+    from_light = -np.asarray(lights.direction)
+    np.testing.assert_allclose(np.linalg.norm(from_light, axis=-1), 1.0, atol=1e-5)
+    # Behind the camera: within 60 degrees of its direction, three standard deviations of the spread. By chance one
+    # light in six of the other half is there too; that all of them are is rare.
+    is_behind = np.all(from_light @ np.array([0.3, 0.0, 0.1]) / np.sqrt(0.1) > 0.5, axis=-1)
+    assert 0.45 < is_behind.mean() < 0.65
 
 
 def test_jittered_camera_keeps_its_position_and_tilts_within_the_limit():

@@ -14,8 +14,10 @@ from vsearch_jax.config import Config
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.types import Camera
 
-# Lights: largest angle from the vertical, and ranges of the factors on the scene's own values.
+# Lights: largest angle from the vertical, share of the images whose lights stand behind the camera and the standard
+# deviation of the offset from its direction, and ranges of the factors on the scene's own values.
 _MAX_LIGHT_ANGLE = jnp.pi / 3
+_SHADOW_PROBABILITY, _SHADOW_SPREAD = 0.5, 0.35
 _DIFFUSE_RANGE, _SPECULAR_RANGE, _AMBIENT_RANGE, _TINT_RANGE = (0.4, 1.3), (0.0, 1.5), (0.5, 1.5), (0.85, 1.15)
 # Camera: largest tilt as a part of the field of view, and range of the factor on the field of view.
 _MAX_SHIFT, _SCALE_RANGE = 0.05, (0.92, 1.08)
@@ -27,25 +29,24 @@ _MAX_HUE, _SATURATION_RANGE, _CONTRAST_RANGE, _MAX_BRIGHTNESS = 0.3, (0.6, 1.4),
 _DEPTH_NOISE, _HOLE_FRACTION, _NOISE_GRID = 0.02, 0.02, 32
 
 
-def randomize_lights(key: Array, scene: RenderScene, center: Array) -> RenderScene:
+def randomize_lights(key: Array, scene: RenderScene, center: Array, camera: Camera) -> RenderScene:
     """Returns a copy of the scene with random lights and a random headlight.
 
-    Each light gets a new position and new diffuse, specular and ambient colours. The light keeps its distance from
-    `center` and shines at `center`. Seen from `center`, the light's direction is uniform within 60 degrees of the
-    vertical.
+    Each light gets a new direction and new diffuse, specular and ambient colours. The light keeps its distance from
+    `center` and shines at `center`. With probability 1/2 the light's direction, seen from `center`, is uniform within
+    60 degrees of the vertical. Otherwise all lights stand behind the camera, so that the shadow of the arm, which
+    carries the camera, falls on the object.
 
     Args:
       key: PRNG key.
       scene: the scene to render.
       center: f32[3] m in world, centre of the view sphere, where the object is.
+      camera: the camera in world.
     """
-    height_key, azimuth_key, diffuse_key, tint_key, specular_key, ambient_key, headlight_key = jax.random.split(key, 7)
+    direction_key, diffuse_key, tint_key, specular_key, ambient_key, headlight_key = jax.random.split(key, 6)
     lights = scene.lights
     shape = lights.position.shape[:1]
-    height = jax.random.uniform(height_key, shape, minval=jnp.cos(_MAX_LIGHT_ANGLE), maxval=1.0)
-    azimuth = jax.random.uniform(azimuth_key, shape, maxval=2.0 * jnp.pi)
-    across = jnp.sqrt(1.0 - height**2)
-    upward = jnp.stack([across * jnp.cos(azimuth), across * jnp.sin(azimuth), height], axis=-1)
+    upward = _light_directions(direction_key, shape[0], camera.position - center)
     distance = jnp.linalg.norm(lights.position - center[None], axis=-1, keepdims=True)
     tint = _uniform(tint_key, (*shape, 3), _TINT_RANGE)
     lights = dataclasses.replace(
@@ -63,6 +64,29 @@ def randomize_lights(key: Array, scene: RenderScene, center: Array) -> RenderSce
         headlight_ambient=scene.headlight_ambient * factor,
         headlight_diffuse=scene.headlight_diffuse * factor,
     )
+
+
+def _light_directions(key: Array, count: int, to_camera: Array) -> Array:
+    """Returns random unit vectors f32[L, 3] from the object to the L lights, above the table.
+
+    Args:
+      key: PRNG key.
+      count: number L of the lights.
+      to_camera: f32[3] m, from the object to the camera.
+    """
+    height_key, azimuth_key, shadow_key, spread_key = jax.random.split(key, 4)
+    height = jax.random.uniform(height_key, (count,), minval=jnp.cos(_MAX_LIGHT_ANGLE), maxval=1.0)
+    azimuth = jax.random.uniform(azimuth_key, (count,), maxval=2.0 * jnp.pi)
+    across = jnp.sqrt(1.0 - height**2)
+    anywhere = jnp.stack([across * jnp.cos(azimuth), across * jnp.sin(azimuth), height], axis=-1)
+    behind = _unit(to_camera)[None] + _SHADOW_SPREAD * jax.random.normal(spread_key, (count, 3))
+    behind = _unit(behind.at[:, 2].set(jnp.abs(behind[:, 2])))
+    return jnp.where(jax.random.bernoulli(shadow_key, _SHADOW_PROBABILITY), behind, anywhere)
+
+
+def _unit(vectors: Array) -> Array:
+    """Returns vectors f32[..., 3] scaled to length 1."""
+    return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def jitter_camera(key: Array, camera: Camera) -> Camera:

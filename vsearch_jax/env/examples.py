@@ -84,7 +84,7 @@ def encoder_example(key: Array, view: View, is_clean: Array, *, env: ViewSearchE
     object_ids = jnp.asarray(env.scene.object_geom_ids)
 
     size = env.config.scene.image_size
-    lit_scene = encoders.randomize_lights(light_key, env.render_scene, env.center)
+    lit_scene = encoders.randomize_lights(light_key, env.render_scene, env.center, camera)
     lit_scene = tree_where(is_clean, env.render_scene, lit_scene)
     jittered = tree_where(is_clean, camera, encoders.jitter_camera(camera_key, camera))
     image = render.render(lit_scene, data, jittered, (size, size))
