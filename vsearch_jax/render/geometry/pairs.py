@@ -50,12 +50,12 @@ class Queue(NamedTuple):
 
     Attributes:
       face: i32[E], number of the face of each entry; meaningless from entry `length` on.
-      count: i32[E], number of pairs of the face; 0 from entry `length` on.
+      num_pairs: i32[E], number of pairs of the face; 0 from entry `length` on.
       length: i32[], number of entries.
     """
 
     face: Array
-    count: Array
+    num_pairs: Array
     length: Array
 
 
@@ -160,7 +160,7 @@ def next_pairs(queue: Queue, position: Position, batch_size: int, zero: Array) -
       end of the queue there is none. Position of the next batch.
     """
     # Each entry has a pair, so the next B entries hold the next B pairs.
-    face, count = (jax.lax.dynamic_slice(x, (position.entry,), (batch_size,)) for x in (queue.face, queue.count))
+    face, count = (jax.lax.dynamic_slice(x, (position.entry,), (batch_size,)) for x in (queue.face, queue.num_pairs))
     left = jnp.minimum(count.at[0].add(-position.rank), batch_size + 1)
     # The sum in f32 cannot overflow, and is exact up to 2^24. What lies beyond B only has to be larger than B.
     total = jnp.minimum(materialize(_running_sum(left.astype(jnp.float32)), zero), 2.0 * batch_size + 1.0)

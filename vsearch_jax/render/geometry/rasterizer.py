@@ -226,14 +226,15 @@ def _depth_of_hits(faces: _Faces, row: Array, column: Array) -> Array:
     return jnp.where(is_inside & (is_parallel | (hit_depth > 0.0)), hit_depth, jnp.inf)
 
 
-def _draw_images(size: tuple[int, int], _: tuple[()], faces: _Faces) -> Raster:
+def _draw_images(size: tuple[int, int], shared: tuple[()], faces: _Faces) -> Raster:
     """Returns the nearest face of each pixel of N images.
 
     Args:
       size: height and width of an image in pixels.
-      _: nothing; `flatten_vmap` calls it so.
+      shared: nothing; `flatten_vmap` calls its function so.
       faces: the faces of each image: arrays [N, T].
     """
+    del shared
     num_images, num_faces = faces.strips.rows.shape
     num_pixels = size[0] * size[1]
     batch_size = min(_BATCH * num_images, _MAX_CPU_BATCH if jax.default_backend() == "cpu" else _MAX_BATCH)
