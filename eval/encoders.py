@@ -31,7 +31,7 @@ from parts import PARTS, write_part
 from vsearch_jax import report, runs
 from vsearch_jax.types import EncoderState, ReachabilityMap
 
-UPDATES = {"pose": 400, "autoencoder": 220, "both": 210}
+UPDATES = {"pose": 800, "autoencoder": 440, "both": 420}
 """Updates of each loss. They take about equal time on the teapot; each row holds its seconds."""
 OBJECTS = ("teapot", "truck", "bracket", "part:plate", "part:bracket", "part:gear")
 SHOWN = {

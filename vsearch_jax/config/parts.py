@@ -66,9 +66,9 @@ class EncoderConfig:
     """Height and width of the kernels of stride-2 convolutions, in pixels."""
     decoder_size: int = 64
     """Height and width of the decoder's image, in pixels."""
-    num_updates: int = 400
+    num_updates: int = 800
     """Number of optimizer updates."""
-    batch_size: int = 64
+    batch_size: int = 32
     """Number of views rendered for each update."""
     learning_rate: float = 1e-3
     """Highest step size of Adam. It decays to zero along a cosine."""

@@ -103,7 +103,7 @@ PRESETS: dict[str, Config] = {
         evaluation=EvaluationConfig(num_initial_views=4, num_runs=1, num_episodes=8, batch_size=8),
         num_chunks=4,
     ),
-    "cpu": Config(sac=SACConfig(num_seeds=3), num_chunks=26),
+    "cpu": Config(sac=SACConfig(num_seeds=3), num_chunks=36),
     "thesis": Config(
         encoder=EncoderConfig(
             loss="autoencoder",
@@ -112,6 +112,7 @@ PRESETS: dict[str, Config] = {
             kernel_size=5,
             decoder_size=128,
             num_updates=30_000,
+            batch_size=64,
             learning_rate=2e-4,
             pool_size=4096,
         ),

@@ -14,14 +14,15 @@ from vsearch_jax.config import Config
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.types import Camera
 
-# Lights: largest angle from the vertical, share of the images whose lights stand behind the camera and the standard
+# Lights: largest angle from the vertical, share of the images whose lights stand behind the camera and standard
 # deviation of the offset from its direction, and ranges of the factors on the scene's own values.
 _MAX_LIGHT_ANGLE = jnp.pi / 3
-_SHADOW_PROBABILITY, _SHADOW_SPREAD = 0.5, 0.35
+_BEHIND_PROBABILITY, _BEHIND_SPREAD = 0.6, 0.35
 _DIFFUSE_RANGE, _SPECULAR_RANGE, _AMBIENT_RANGE, _TINT_RANGE = (0.4, 1.3), (0.0, 1.5), (0.5, 1.5), (0.85, 1.15)
 # Camera: largest tilt as a part of the field of view, and range of the factor on the field of view.
 _MAX_SHIFT, _SCALE_RANGE = 0.05, (0.92, 1.08)
 # Image.
+_SHADOW_PROBABILITY, _NUM_SHADOWS, _SHADOW_RADIUS, _SHADOW_FACTOR = 0.7, 2, (0.08, 0.3), (0.35, 0.8)
 _BACKGROUND_PROBABILITY = 0.5
 _TEXTURE_GRIDS = (1, 2, 8, 32)  # a colour, a gradient, patches, grain
 _NUM_OCCLUSIONS, _OCCLUSION_PROBABILITY, _MAX_OCCLUSION = 2, 0.4, 0.35
@@ -33,9 +34,9 @@ def randomize_lights(key: Array, scene: RenderScene, center: Array, camera: Came
     """Returns a copy of the scene with random lights and a random headlight.
 
     Each light gets a new direction and new diffuse, specular and ambient colours. The light keeps its distance from
-    `center` and shines at `center`. With probability 1/2 the light's direction, seen from `center`, is uniform within
-    60 degrees of the vertical. Otherwise all lights stand behind the camera, so that the shadow of the arm, which
-    carries the camera, falls on the object.
+    `center` and shines at `center`. With probability 0.6 all lights stand behind the camera, so that the shadow of the
+    arm, which carries the camera, falls on the object. Otherwise the direction of each light, seen from `center`, is
+    uniform within 60 degrees of the vertical.
 
     Args:
       key: PRNG key.
@@ -74,14 +75,14 @@ def _light_directions(key: Array, count: int, to_camera: Array) -> Array:
       count: number L of the lights.
       to_camera: f32[3] m, from the object to the camera.
     """
-    height_key, azimuth_key, shadow_key, spread_key = jax.random.split(key, 4)
+    height_key, azimuth_key, behind_key, spread_key = jax.random.split(key, 4)
     height = jax.random.uniform(height_key, (count,), minval=jnp.cos(_MAX_LIGHT_ANGLE), maxval=1.0)
     azimuth = jax.random.uniform(azimuth_key, (count,), maxval=2.0 * jnp.pi)
     across = jnp.sqrt(1.0 - height**2)
     anywhere = jnp.stack([across * jnp.cos(azimuth), across * jnp.sin(azimuth), height], axis=-1)
-    behind = _unit(to_camera)[None] + _SHADOW_SPREAD * jax.random.normal(spread_key, (count, 3))
+    behind = _unit(to_camera)[None] + _BEHIND_SPREAD * jax.random.normal(spread_key, (count, 3))
     behind = _unit(behind.at[:, 2].set(jnp.abs(behind[:, 2])))
-    return jnp.where(jax.random.bernoulli(shadow_key, _SHADOW_PROBABILITY), behind, anywhere)
+    return jnp.where(jax.random.bernoulli(behind_key, _BEHIND_PROBABILITY), behind, anywhere)
 
 
 def _unit(vectors: Array) -> Array:
@@ -110,8 +111,9 @@ def jitter_camera(key: Array, camera: Camera) -> Camera:
 def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Array:
     """Adds random disturbances to the encoder's input image. The encoder must learn to ignore them.
 
-    Each kind of input gets occlusions. rgb and depth get a random background with probability 1/2. Then rgb gets random
-    hue, saturation, contrast and brightness; depth gets noise and holes; a silhouette gets inverted spots.
+    Each kind of input gets occlusions. rgb gets shadows first. rgb and depth get a random background with probability
+    1/2. Then rgb gets random hue, saturation, contrast and brightness; depth gets noise and holes; a silhouette gets
+    inverted spots.
 
     Args:
       key: PRNG key.
@@ -122,9 +124,11 @@ def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Arr
     Returns:
       Disturbed image, f32[H, W, C] in [0, 1].
     """
-    background_key, occlusion_key, sensor_key = jax.random.split(key, 3)
+    background_key, occlusion_key, sensor_key, shadow_key = jax.random.split(key, 4)
     if config.encoder.input == "silhouette":
         return _disturb_silhouette(sensor_key, jnp.round(occlude(occlusion_key, x)))
+    if config.encoder.input == "rgb":
+        x = cast_shadows(shadow_key, x)
     x = occlude(occlusion_key, replace_background(background_key, x, is_object))
     disturb = _disturb_rgb if config.encoder.input == "rgb" else _disturb_depth
     return jnp.clip(disturb(sensor_key, x), 0.0, 1.0)
@@ -153,6 +157,31 @@ def replace_background(key: Array, x: Array, is_object: Array) -> Array:
     choice_key, texture_key = jax.random.split(key)
     is_replaced = jax.random.bernoulli(choice_key, _BACKGROUND_PROBABILITY)
     return jnp.where(is_replaced & ~is_object[..., None], _texture(texture_key, x.shape), x)
+
+
+def cast_shadows(key: Array, x: Array) -> Array:
+    """Darkens parts of an image with probability 0.7, as the shadows of two links of an arm would.
+
+    The parts are two strips with round ends, of random place, direction, length and width. Rendered shadows are exact,
+    but each costs an image, and few of them cover the object.
+
+    Args:
+      key: PRNG key.
+      x: image f32[H, W, C] in [0, 1] of H x W pixels and C channels.
+    """
+    chance_key, factor_key, start_key, angle_key, length_key, radius_key = jax.random.split(key, 6)
+    starts = jax.random.uniform(start_key, (_NUM_SHADOWS, 2))
+    angles = jax.random.uniform(angle_key, (_NUM_SHADOWS,), maxval=2.0 * jnp.pi)
+    lengths = jax.random.uniform(length_key, (_NUM_SHADOWS,))
+    radii = _uniform(radius_key, (_NUM_SHADOWS,), _SHADOW_RADIUS)
+    rows, columns = _pixel_centers(x.shape[0])[:, None], _pixel_centers(x.shape[1])[None]
+    is_dark = jnp.zeros(x.shape[:2], bool)
+    for (row, column), angle, length, radius in zip(starts, angles, lengths, radii, strict=True):
+        down, across, cos, sin = rows - row, columns - column, jnp.cos(angle), jnp.sin(angle)
+        along = jnp.clip(down * cos + across * sin, 0.0, length)
+        is_dark |= (down - along * cos) ** 2 + (across - along * sin) ** 2 < radius**2
+    is_dark &= jax.random.bernoulli(chance_key, _SHADOW_PROBABILITY)
+    return jnp.where(is_dark[..., None], x * _uniform(factor_key, (), _SHADOW_FACTOR), x)
 
 
 def occlude(key: Array, x: Array) -> Array:
