@@ -32,7 +32,7 @@ from vsearch_jax import report, runs
 from vsearch_jax.types import EncoderState, ReachabilityMap
 
 UPDATES = {"pose": 800, "autoencoder": 440, "both": 420}
-"""Updates of each loss. They take about equal time on the teapot; each row holds its seconds."""
+"""Updates of each loss. They shall take about equal time; each row holds its seconds."""
 OBJECTS = ("teapot", "truck", "bracket", "part:plate", "part:bracket", "part:gear")
 SHOWN = {
     "false_match_rate": ("matches > 10° off (%)", 100.0),

@@ -118,8 +118,8 @@ def test_most_images_are_lit_from_behind_the_camera_and_above_the_table():
     assert np.all(offset[..., 2] > 0.0)
     from_light = -np.asarray(lights.direction)
     np.testing.assert_allclose(np.linalg.norm(from_light, axis=-1), 1.0, atol=1e-5)
-    # Behind the camera: within 60 degrees of its direction, three standard deviations of the spread. By chance one
-    # light in six of the other half is there too; that all of them are is rare.
+    # Behind the camera: within 60 degrees of its direction, three standard deviations of the spread. By chance a light
+    # of the others is there too; that both are is rare.
     is_behind = np.all(from_light @ np.array([0.3, 0.0, 0.1]) / np.sqrt(0.1) > 0.5, axis=-1)
     assert 0.55 < is_behind.mean() < 0.75
 

@@ -143,7 +143,7 @@ def _to_pixels(x: list[Array], w: list[Array], scale: Array, center: Array) -> l
 
 
 def _pixel_interval(x: list[Array], w: list[Array], scale: Array, center: Array, count: int) -> Array:
-    """Returns i32[T], the interval of pixels along one axis that may show each face; see `Pairs` for its bits.
+    """Returns i32[T], the interval of pixels along one axis that may show each face; see `Strips` for its bits.
 
     If all three corners are in front of the viewer, their pixels bound the face. If a corner is behind, the interval is
     the whole axis, except for faces that lie wholly outside one edge of the image. That test holds for any corners.

@@ -21,7 +21,7 @@ _OWN_SHARE, _NEAR_SHARE = 1 / 3, 1 / 3
 _NEAR_DEG = 5.0
 """Standard deviation of near targets about the end of the step, in azimuth and elevation."""
 _EDGE_MARGIN_DEG = 1.0
-"""Known actions end this far inside the band. A policy that is off by less then still commands a reachable view."""
+"""Known actions end this far inside the band. A policy whose error is smaller still commands a reachable view."""
 _BEYOND_SHARE = 1 / 3
 """Share of the steps whose elevation is not folded into the band."""
 _CELL_AZIMUTHS, _CELL_ELEVATIONS = 256, 32
