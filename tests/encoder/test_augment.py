@@ -64,14 +64,9 @@ def test_half_of_the_backgrounds_are_replaced_and_the_object_is_kept():
     assert np.all(np.any(images[is_replaced] != 0.5, axis=-1)[:, ~is_object])
 
 
-def test_shadows_darken_a_part_of_most_images_by_one_factor_each():
-    x = jax.random.uniform(jax.random.key(1), (32, 48, 3), minval=0.2)
-    images = jax.jit(jax.vmap(augment.cast_shadows, in_axes=(0, None)))(jax.random.split(jax.random.key(0), 400), x)
-    ratio = np.asarray(images) / np.asarray(x)
-    darkest = ratio.min(axis=(1, 2, 3), keepdims=True)
-    assert np.all((np.abs(ratio - 1.0) < 1e-5) | (np.abs(ratio - darkest) < 1e-5))
-    assert np.all((darkest > 0.35 - 1e-5) & ((darkest < 0.8) | (darkest > 1.0 - 1e-5)))
-    share = (ratio < 0.9).mean(axis=(1, 2, 3))
+def test_shade_covers_a_part_of_most_images():
+    draw = jax.jit(jax.vmap(augment.draw_shade, in_axes=(0, None)), static_argnums=1)
+    share = np.asarray(draw(jax.random.split(jax.random.key(0), 400), 32)).mean(axis=(1, 2))
     assert 0.6 < (share > 0.0).mean() < 0.8
     assert 0.1 < share[share > 0.0].mean() < 0.6
 

@@ -62,6 +62,20 @@ def test_shadows_equal_mj_ray_towards_the_light(light: mjtLightType, seed: int) 
     assert np.asarray(without_shadows.rgb)[ids >= 0].min() == 1.0
 
 
+def test_shade_takes_away_the_lights_that_cast_shadows() -> None:
+    model = mujoco.MjModel.from_xml_string(LIT_PLANE)
+    without_spot = mujoco.MjModel.from_xml_string(LIT_PLANE.replace('type="spot"', 'type="spot" active="false"'))
+    frames = poses(model, forward(model))
+    eye = render.camera(frames, model, "eye")
+    shade = np.zeros(SIZE, bool)
+    shade[10:40, 20:50] = True
+    shaded = _render(render.compile_scene(model), frames, eye, size=SIZE, shade=shade)
+    lit, dark = (_render(render.compile_scene(one), frames, eye, size=SIZE) for one in (model, without_spot))
+    assert np.abs(lit.rgb - dark.rgb)[shade].max() > 0.05
+    np.testing.assert_allclose(shaded.rgb, np.where(shade[..., None], dark.rgb, lit.rgb), atol=1e-6)
+    np.testing.assert_array_equal(shaded.depth, lit.depth)
+
+
 def test_light_model_equals_the_formula_of_opengl() -> None:
     model = mujoco.MjModel.from_xml_string(LIT_PLANE)
     data = forward(model)

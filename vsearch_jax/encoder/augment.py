@@ -22,7 +22,7 @@ _DIFFUSE_RANGE, _SPECULAR_RANGE, _AMBIENT_RANGE, _TINT_RANGE = (0.4, 1.3), (0.0,
 # Camera: largest tilt as a part of the field of view, and range of the factor on the field of view.
 _MAX_SHIFT, _SCALE_RANGE = 0.05, (0.92, 1.08)
 # Image.
-_SHADOW_PROBABILITY, _NUM_SHADOWS, _SHADOW_RADIUS, _SHADOW_FACTOR = 0.7, 2, (0.08, 0.3), (0.35, 0.8)
+_SHADOW_PROBABILITY, _NUM_SHADOWS, _SHADOW_RADIUS = 0.7, 2, (0.08, 0.3)
 _BACKGROUND_PROBABILITY = 0.5
 _TEXTURE_GRIDS = (1, 2, 8, 32)  # a colour, a gradient, patches, grain
 _NUM_OCCLUSIONS, _OCCLUSION_PROBABILITY, _MAX_OCCLUSION = 2, 0.4, 0.35
@@ -111,7 +111,7 @@ def jitter_camera(key: Array, camera: Camera) -> Camera:
 def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Array:
     """Adds random disturbances to the encoder's input image. The encoder must learn to ignore them.
 
-    Each kind of input gets occlusions. rgb gets shadows first. rgb and depth get a random background with probability
+    Each kind of input gets occlusions. rgb and depth get a random background with probability
     1/2. Then rgb gets random hue, saturation, contrast and brightness; depth gets noise and holes; a silhouette gets
     inverted spots.
 
@@ -124,11 +124,9 @@ def augment_input(key: Array, x: Array, is_object: Array, config: Config) -> Arr
     Returns:
       Disturbed image, f32[H, W, C] in [0, 1].
     """
-    background_key, occlusion_key, sensor_key, shadow_key = jax.random.split(key, 4)
+    background_key, occlusion_key, sensor_key = jax.random.split(key, 3)
     if config.encoder.input == "silhouette":
         return _disturb_silhouette(sensor_key, jnp.round(occlude(occlusion_key, x)))
-    if config.encoder.input == "rgb":
-        x = cast_shadows(shadow_key, x)
     x = occlude(occlusion_key, replace_background(background_key, x, is_object))
     disturb = _disturb_rgb if config.encoder.input == "rgb" else _disturb_depth
     return jnp.clip(disturb(sensor_key, x), 0.0, 1.0)
@@ -159,29 +157,28 @@ def replace_background(key: Array, x: Array, is_object: Array) -> Array:
     return jnp.where(is_replaced & ~is_object[..., None], _texture(texture_key, x.shape), x)
 
 
-def cast_shadows(key: Array, x: Array) -> Array:
-    """Darkens parts of an image with probability 0.7, as the shadows of two links of an arm would.
+def draw_shade(key: Array, size: int) -> Array:
+    """Draws where the shadows of two links of an arm might fall: bool[size, size], empty with probability 0.3.
 
-    The parts are two strips with round ends, of random place, direction, length and width. Rendered shadows are exact,
-    but each costs an image, and few of them cover the object.
+    The shadows are strips with round ends, of random place, direction, length and width. The arm's own shadows are
+    rendered too, but few of them cover the object.
 
     Args:
       key: PRNG key.
-      x: image f32[H, W, C] in [0, 1] of H x W pixels and C channels.
+      size: height and width of the image in pixels.
     """
-    chance_key, factor_key, start_key, angle_key, length_key, radius_key = jax.random.split(key, 6)
+    chance_key, start_key, angle_key, length_key, radius_key = jax.random.split(key, 5)
     starts = jax.random.uniform(start_key, (_NUM_SHADOWS, 2))
     angles = jax.random.uniform(angle_key, (_NUM_SHADOWS,), maxval=2.0 * jnp.pi)
     lengths = jax.random.uniform(length_key, (_NUM_SHADOWS,))
     radii = _uniform(radius_key, (_NUM_SHADOWS,), _SHADOW_RADIUS)
-    rows, columns = _pixel_centers(x.shape[0])[:, None], _pixel_centers(x.shape[1])[None]
-    is_dark = jnp.zeros(x.shape[:2], bool)
+    rows, columns = _pixel_centers(size)[:, None], _pixel_centers(size)[None]
+    is_dark = jnp.zeros((size, size), bool)
     for (row, column), angle, length, radius in zip(starts, angles, lengths, radii, strict=True):
         down, across, cos, sin = rows - row, columns - column, jnp.cos(angle), jnp.sin(angle)
         along = jnp.clip(down * cos + across * sin, 0.0, length)
         is_dark |= (down - along * cos) ** 2 + (across - along * sin) ** 2 < radius**2
-    is_dark &= jax.random.bernoulli(chance_key, _SHADOW_PROBABILITY)
-    return jnp.where(is_dark[..., None], x * _uniform(factor_key, (), _SHADOW_FACTOR), x)
+    return is_dark & jax.random.bernoulli(chance_key, _SHADOW_PROBABILITY)
 
 
 def occlude(key: Array, x: Array) -> Array:

@@ -78,7 +78,7 @@ def encoder_example(key: Array, view: View, is_clean: Array, *, env: ViewSearchE
       is_clean: bool[], the input is the image as a search sees it, without random lights, jitter and augmentation.
       env: the task. Scene and arm are used, the encoder in it is not.
     """
-    pose_key, light_key, camera_key, image_key = jax.random.split(key, 4)
+    pose_key, light_key, shade_key, camera_key, image_key = jax.random.split(key, 5)
     _, qpos, _ = env.resolve_view(view, env.random_joints(pose_key), jnp.bool_(False))
     data, camera = env.forward(qpos)
     object_ids = jnp.asarray(env.scene.object_geom_ids)
@@ -87,7 +87,8 @@ def encoder_example(key: Array, view: View, is_clean: Array, *, env: ViewSearchE
     lit_scene = encoders.randomize_lights(light_key, env.render_scene, env.center, camera)
     lit_scene = tree_where(is_clean, env.render_scene, lit_scene)
     jittered = tree_where(is_clean, camera, encoders.jitter_camera(camera_key, camera))
-    image = render.render(lit_scene, data, jittered, (size, size))
+    shade = encoders.draw_shade(shade_key, size) & ~is_clean
+    image = render.render(lit_scene, data, jittered, (size, size), shade)
     pixels = encoders.network_input(image, object_ids, env.config)
     inputs = encoders.augment_input(image_key, pixels, render.silhouette(image, env.scene.object_geom_ids), env.config)
     inputs = jnp.where(is_clean, pixels, inputs)

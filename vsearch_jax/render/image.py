@@ -41,10 +41,10 @@ _CPU_TILE = (32, 64)
 # The rasteriser keeps the columns and rows of a face in 16 bits.
 _MAX_EDGE = 2**15 - 1
 
-_Tile: TypeAlias = "tuple[tuple[Array, Array], Raster | trace.Hits | None]"
-"""One tile of the image: slopes of its rays, f32[1, w] and f32[h, 1]; and what is known of its pixels, if anything.
+_Tile: TypeAlias = "tuple[tuple[Array, Array], Raster | trace.Hits | None, Array | None]"
+"""One tile of the image: slopes of its rays, f32[1, w] and f32[h, 1]; what is known of its pixels; its shade.
 
-That is the nearest face, or the geom that each pixel shows.
+What is known is the nearest face, or the geom that each pixel shows, or nothing. The shade is bool[h, w] or nothing.
 """
 
 
@@ -66,7 +66,9 @@ class _ImageContext(NamedTuple):
     zero: Array
 
 
-def render(scene: RenderScene, data: GeomPoses, camera: Camera, size: tuple[int, int]) -> Image:
+def render(
+    scene: RenderScene, data: GeomPoses, camera: Camera, size: tuple[int, int], shade: Array | None = None
+) -> Image:
     """Renders one image of a scene as a camera sees it: colour, depth, geom numbers, normals. Batch it with `jax.vmap`.
 
     Depth and geom_id equal those of C MuJoCo's `mj_ray` through the pixels' centres. Colours follow MuJoCo's light
@@ -87,6 +89,8 @@ def render(scene: RenderScene, data: GeomPoses, camera: Camera, size: tuple[int,
         f32[nbody, 3] m and xmat f32[nbody, 3, 3], body to world.
       camera: the camera in the world frame.
       size: height H and width W of the image in pixels, static.
+      shade: bool[H, W], pixels that the lights which cast shadows do not reach, as if something outside of the scene
+        stood between. None is no such pixel.
 
     Returns:
       Colour rgb f32[H, W, 3] in [0, 1]. Depth f32[H, W] m along the optical axis, +inf where the ray hits nothing.
@@ -99,11 +103,18 @@ def render(scene: RenderScene, data: GeomPoses, camera: Camera, size: tuple[int,
     if not all(0 < count <= _MAX_EDGE for count in size):
         raise RenderError(f"size is {size}; allowed: height and width from 1 to {_MAX_EDGE}")
     frames, lights = _camera_frames(scene, data, camera), light_poses(scene, data, camera)
-    return _draw(scene, frames, lights, camera, (size[0], size[1]))
+    return _draw(scene, frames, lights, camera, (size[0], size[1]), shade)
 
 
 @trace_once("size")
-def _draw(scene: RenderScene, frames: trace.Frames, lights: LightPoses, camera: Camera, size: tuple[int, int]) -> Image:
+def _draw(
+    scene: RenderScene,
+    frames: trace.Frames,
+    lights: LightPoses,
+    camera: Camera,
+    size: tuple[int, int],
+    shade: Array | None,
+) -> Image:
     """Returns the image of a scene whose geoms and lights have the given poses relative to the camera."""
     tiling = _choose_tiling(size)
     zero = runtime_zero(frames.origin)
@@ -117,12 +128,12 @@ def _draw(scene: RenderScene, frames: trace.Frames, lights: LightPoses, camera: 
     if scene.triangles is not None:
         whole = _rasterize_faces(fixed_scene, fixed_frames, fixed_pixels, size, zero)
         raster = Raster(tiling.split(whole.depth), tiling.split(whole.face))
-    tiles: _Tile = (tiling.split_axes(*rays), raster)
+    tiles: _Tile = (tiling.split_axes(*rays), raster, None if shade is None else tiling.split(shade))
     shadows: dict[int, ShadowMap] = {}
     if needs_shadow_maps(scene):
         hits = jax.lax.map(functools.partial(_nearest_hits, fixed_scene, fixed_frames), jax.lax.stop_gradient(tiles))
         shadows = _cast_shadow_maps(fixed_scene, fixed_frames, fixed_lights, (tiles[0], hits), zero)
-        tiles = (tiles[0], hits)
+        tiles = (tiles[0], hits, tiles[2])
     context = _ImageContext(frames, rotation, lights, shadows, zero)
     images = jax.lax.map(functools.partial(_render_tile, scene, context), tiles)
     return jax.tree.map(tiling.join, images)
@@ -210,7 +221,7 @@ def _cast_shadow_maps(
 
 
 def _nearest_hits(scene: RenderScene, frames: trace.Frames, tile: _Tile) -> trace.Hits:
-    rays, known = tile
+    rays, known, _ = tile
     if isinstance(known, trace.Hits):
         return known
     hits = trace.nearest_primitives(scene, frames, *rays)
@@ -219,11 +230,14 @@ def _nearest_hits(scene: RenderScene, frames: trace.Frames, tile: _Tile) -> trac
 
 def _render_tile(scene: RenderScene, context: _ImageContext, tile: _Tile) -> Image:
     """Returns the image of one tile. Its rgb and normal have the channel first: f32[3, h, w]."""
-    rays, zero = tile[0], context.zero
+    rays, _, shade = tile
+    zero = context.zero
     hits = _nearest_hits(*jax.lax.stop_gradient((scene, context.frames, tile)))
     depth, surface = resolve_surface(scene, context.frames, hits, rays, zero)
     hits = hits._replace(depth=depth)
     lit = lit_by(scene, context.frames, hits, rays, (context.lights, context.shadows), surface)
+    if shade is not None:
+        lit = {light: jnp.where(shade, 0.0, is_lit) for light, is_lit in lit.items()}
     channels = shading.shade(scene, surface, materialize(incidences(scene, context.lights, surface, rays, lit), zero))
     background = _background(scene, context, rays)
     rgb = [jnp.where(hits.is_hit, channel, b) for channel, b in zip(channels, background, strict=True)]
