@@ -31,7 +31,7 @@ from parts import PARTS, write_part
 from vsearch_jax import report, runs
 from vsearch_jax.types import EncoderState, ReachabilityMap
 
-UPDATES = {"pose": 800, "autoencoder": 440, "both": 420}
+UPDATES = {"pose": 500, "autoencoder": 275, "both": 260}
 """Updates of each loss. They shall take about equal time; each row holds its seconds."""
 OBJECTS = ("teapot", "truck", "bracket", "part:plate", "part:bracket", "part:gear")
 SHOWN = {

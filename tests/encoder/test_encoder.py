@@ -8,7 +8,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -104,6 +103,22 @@ def test_network_input_follows_the_config():
     np.testing.assert_array_equal(silhouette[..., 0], [[0.0, 1.0], [0.0, 1.0]])
 
 
+@pytest.mark.parametrize(("intensity", "kind"), [("log", "rgb"), ("linear", "rgb"), ("log", "depth")])
+def test_a_shadow_is_an_offset_only_of_the_logarithm_of_rgb(intensity, kind):
+    config = smoke_config(intensity=intensity, input=kind)
+    params = encoders.init(jax.random.key(0), config).params
+    kernel = params["encoder"]["convolutions"][0]["kernel"]
+    if kind == "rgb":  # filters that ignore an offset common to red, green and blue
+        params["encoder"]["convolutions"][0]["kernel"] = kernel - kernel.mean(axis=2, keepdims=True)
+    x = jax.random.uniform(jax.random.key(1), (32, 32, kernel.shape[2]), minval=0.4)
+    latents = [encoders.raw_latent(params, image, config) for image in (x, 0.5 * x)]
+    change = jnp.linalg.norm(latents[1] - latents[0]) / jnp.linalg.norm(latents[0])
+    if kind == "rgb" and intensity == "log":
+        assert change < 0.15
+    else:
+        np.testing.assert_allclose(change, 0.5, atol=0.02)  # layers without biases are linear in a positive factor
+
+
 # -- loss and whitening ---------------------------------------------------------------------------------------------
 
 
@@ -152,10 +167,16 @@ def test_whitening_bounds_small_eigenvalues_and_is_the_identity_for_a_constant_l
 
 
 @pytest.mark.parametrize(
-    ("kind", "loss"), [*((kind, "autoencoder") for kind in INPUTS), ("rgb", "pose"), ("rgb", "both")]
+    ("kind", "loss", "optimizer"),
+    [
+        *((kind, "autoencoder", "adam") for kind in INPUTS),
+        ("rgb", "pose", "adam"),
+        ("rgb", "pose", "muon"),
+        ("rgb", "both", "muon"),
+    ],
 )
-def test_updates_reduce_the_loss_and_change_nothing_after_num_updates(kind, loss):
-    config = smoke_config(input=kind, loss=loss, num_updates=150, learning_rate=3e-3)
+def test_updates_reduce_the_loss_and_change_nothing_after_num_updates(kind, loss, optimizer):
+    config = smoke_config(input=kind, loss=loss, optimizer=optimizer, num_updates=150, learning_rate=3e-3)
     shape = (8, 32, 32, network.in_features(config.encoder))
     inputs = jax.random.uniform(jax.random.key(1), shape)
     targets = None if loss == "pose" else jax.image.resize(inputs, (8, 16, 16, shape[-1]), "linear")
@@ -174,5 +195,23 @@ def test_updates_reduce_the_loss_and_change_nothing_after_num_updates(kind, loss
     after, _ = update(end)
     for a, b in zip(jax.tree.leaves(end.params), jax.tree.leaves(after.params), strict=True):
         np.testing.assert_array_equal(a, b)
-    count = optax.tree_utils.tree_get(end.opt_state, "ScaleByAdamState").count
-    assert int(count) == 150
+    counts = [x for path, x in jax.tree.leaves_with_path(end.opt_state) if "count" in jax.tree_util.keystr(path)]
+    assert set(np.asarray(counts)) == {150}
+
+
+def test_a_step_of_muon_is_orthogonal_and_of_the_size_of_adams():
+    config = smoke_config(optimizer="muon", learning_rate=1e-3)
+    before = encoders.init(jax.random.key(0), config)
+    inputs = jax.random.uniform(jax.random.key(1), (8, 32, 32, 3))
+    angles = 0.4 * jnp.abs(jnp.arange(8.0)[:, None] - jnp.arange(8.0)[None])
+    after = encoders.update(before, inputs, None, angles, config)[0]
+    steps = [b - a for a, b in zip(jax.tree.leaves(before.params), jax.tree.leaves(after.params), strict=True)]
+    matrices = [np.asarray(x).reshape(-1, x.shape[-1]) for x in steps if x.ndim > 1]
+    assert len(matrices) == 3
+    for matrix in matrices:
+        singular = np.linalg.svd(matrix, compute_uv=False)
+        expected = 0.2e-3 * np.sqrt(max(matrix.shape))  # an orthogonal matrix whose entries have this root mean square
+        rank = np.sum(singular > 0.3 * expected)
+        assert rank >= 6  # of a gradient of 8 images
+        assert singular.max() < 1.3 * expected
+        assert np.median(singular[:rank]) > 0.6 * expected

@@ -56,6 +56,8 @@ class EncoderConfig:
     """Weight of the wide part of the cosine that the pose loss wants. The wide part leads back from the far side."""
     input: Literal["rgb", "depth", "silhouette"] = "rgb"
     """Part of the image that the encoder reads."""
+    intensity: Literal["linear", "log"] = "log"
+    """Scale of rgb in the first layer. log: a shadow is an offset, which a filter can ignore. Else it has no effect."""
     code_size: int = 128
     """Number of entries in the code."""
     channels: tuple[int, ...] = (64, 128, 128)
@@ -66,12 +68,14 @@ class EncoderConfig:
     """Height and width of the kernels of stride-2 convolutions, in pixels."""
     decoder_size: int = 64
     """Height and width of the decoder's image, in pixels."""
-    num_updates: int = 800
+    num_updates: int = 500
     """Number of optimizer updates."""
     batch_size: int = 32
     """Number of views rendered for each update."""
-    learning_rate: float = 1e-3
-    """Highest step size of Adam. It decays to zero along a cosine."""
+    optimizer: Literal["adam", "muon"] = "muon"
+    """muon: orthogonal steps for matrices and kernels, Adam for biases. adam: Adam for all parameters (thesis)."""
+    learning_rate: float = 8e-3
+    """Highest step size of the optimizer. It decays to zero along a cosine."""
     bootstrap_fraction: float = 0.25
     """Fraction of the pixels that enter the loss. They are the pixels with the largest error."""
     whitening_power: float = 0.0
@@ -82,6 +86,8 @@ class EncoderConfig:
     def __post_init__(self) -> None:
         require(self, "loss", self.loss in ("autoencoder", "pose", "both"), "autoencoder, pose or both")
         require(self, "input", self.input in ("rgb", "depth", "silhouette"), "rgb, depth or silhouette")
+        require(self, "intensity", self.intensity in ("linear", "log"), "linear or log")
+        require(self, "optimizer", self.optimizer in ("adam", "muon"), "adam or muon")
         require(self, "threshold_angle_deg", 0.0 < self.threshold_angle_deg <= 30.0, "greater than 0, at most 30")
         require(self, "wide_weight", 0.0 <= self.wide_weight <= 0.9, "from 0 to 0.9")
         require_positive(self, "code_size", "num_updates", "batch_size", "learning_rate", "decoder_size")

@@ -103,10 +103,12 @@ PRESETS: dict[str, Config] = {
         evaluation=EvaluationConfig(num_initial_views=4, num_runs=1, num_episodes=8, batch_size=8),
         num_chunks=4,
     ),
-    "cpu": Config(sac=SACConfig(num_seeds=3), num_chunks=36),
+    "cpu": Config(sac=SACConfig(num_seeds=3), num_chunks=41),
     "thesis": Config(
         encoder=EncoderConfig(
             loss="autoencoder",
+            intensity="linear",
+            optimizer="adam",
             channels=(128, 256, 256, 512),
             stem_stride=2,
             kernel_size=5,

@@ -1,4 +1,4 @@
-"""Training of the encoder with Adam: loss of the decoder, pose loss; then mean and partial whitening of the latent."""
+"""Training of the encoder: optimizer, loss of the decoder, pose loss; mean and partial whitening of the latent."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 import optax
+import optax.contrib
 from jax import Array
 
 from vsearch_jax.config import Config
@@ -19,6 +20,8 @@ _NUM_BISECTIONS = 16
 """The threshold is then exact to the largest error / 65,536, and the loss to the square of that."""
 _EIGENVALUE_FLOOR = 1e-2
 """Smallest relative eigenvalue. Smaller eigenvalues are mostly noise: shadows of the other arm links, light."""
+_ADAM_RMS = 0.2
+"""Root mean square of the entries of Muon's steps in units of the step size. Adam's is about 0.2 (arXiv 2502.16982)."""
 
 
 def init(key: Array, config: Config) -> EncoderState:
@@ -36,8 +39,33 @@ def init(key: Array, config: Config) -> EncoderState:
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Returns the encoder's optimizer: Adam. Its learning rate falls to zero as a cosine over `encoder.num_updates`."""
-    return optax.adam(optax.cosine_decay_schedule(config.encoder.learning_rate, config.encoder.num_updates))
+    """Returns the encoder's optimizer, `encoder.optimizer`. Its step size falls to zero as a cosine over the updates.
+
+    `muon` makes the steps of kernels and matrices orthogonal, and scales them to the size of Adam's (Jordan et al.
+    2024, https://kellerjordan.github.io/posts/muon; Liu et al. 2025, arXiv 2502.16982). Biases keep Adam.
+
+    Args:
+      config: the run's config; its encoder part is read.
+    """
+    step_size = optax.cosine_decay_schedule(config.encoder.learning_rate, config.encoder.num_updates)
+    if config.encoder.optimizer == "adam":
+        return optax.adam(step_size)
+    return optax.contrib.muon(
+        step_size,
+        adam_learning_rate=step_size,
+        muon_weight_dimension_numbers=_matrix_axes,
+        consistent_rms=_ADAM_RMS,
+    )
+
+
+def _matrix_axes(params: optax.Params) -> optax.Params:
+    """Returns for each parameter which axes Muon takes as a matrix's rows and columns, or None for a bias."""
+
+    def axes(x: Array) -> optax.contrib.MuonDimensionNumbers | None:
+        last = x.ndim - 1
+        return optax.contrib.MuonDimensionNumbers(tuple(range(last)), last) if last > 0 else None
+
+    return jax.tree.map(axes, params)
 
 
 def bootstrapped_mean(errors: Array, fraction: float) -> Array:
@@ -83,7 +111,7 @@ def reconstruction_loss(params: ParamTree, latent: Array, target: Array, config:
 def update(
     encoder: EncoderState, inputs: Array, targets: Array | None, angles: Array, config: Config
 ) -> tuple[EncoderState, Array, Array]:
-    """Trains encoder, and decoder if there is one, by one step of Adam on a batch of B views.
+    """Trains encoder, and decoder if there is one, by one step of the optimizer on a batch of B views.
 
     Args:
       encoder: state before the step. Latent mean and whitening do not change.
@@ -108,7 +136,7 @@ def update(
 
     (loss, latents), gradients = jax.value_and_grad(batch_loss, has_aux=True)(encoder.params)
     with jax.numpy_dtype_promotion("standard"):  # optax raises a float to the power of its integer step count
-        updates, opt_state = optimizer(config).update(gradients, encoder.opt_state)
+        updates, opt_state = optimizer(config).update(gradients, encoder.opt_state, encoder.params)
     # optax keeps the structure of the parameters, but its type is any tree.
     params = cast(ParamTree, optax.apply_updates(encoder.params, updates))
     return dataclasses.replace(encoder, params=params, opt_state=opt_state), loss, latents

@@ -18,6 +18,9 @@ from jax import Array
 from vsearch_jax.config import Config, EncoderConfig
 from vsearch_jax.types import EncoderState, Image, ParamTree
 
+_LOG_FLOOR, _LOG_OFFSET = 0.05, 2.2
+"""Intensity that counts as almost black, and the logarithm's value at a mean intensity of 0.4."""
+
 
 def convolution_by_xla(x: Array, kernel: Array, stride: int) -> Array:
     """Computes a strided convolution of one image, with "SAME" padding, by XLA's own operation.
@@ -132,9 +135,12 @@ class Encoder(nnx.Module):
         self.convolutions = nnx.List([StridedConvolution(*layer, rngs=rngs) for layer in layers])
         cells = (image_size // math.prod(strides)) ** 2
         self.dense = nnx.Linear(cells * config.channels[-1], config.code_size, rngs=rngs)
+        self.is_log = config.input == "rgb" and config.intensity == "log"
 
     def __call__(self, x: Array) -> Array:
-        """Returns the raw latent f32[Z] of `x`, f32[H, W, C]."""
+        """Returns the raw latent f32[Z] of `x`, f32[H, W, C] in [0, 1]."""
+        if self.is_log:
+            x = jnp.log1p(x / _LOG_FLOOR) - _LOG_OFFSET
         for convolution in self.convolutions:
             x = jax.nn.relu(convolution(x))
         return self.dense(x.reshape(-1))

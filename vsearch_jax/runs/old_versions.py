@@ -25,7 +25,13 @@ _DROPPED = {UNVERSIONED: ("replay.data.truncated",)}
 
 _LATER_FIELDS: dict[str, dict[str, object]] = {
     "scene": {"symmetry": None},
-    "encoder": {"loss": "autoencoder", "threshold_angle_deg": 3.0, "wide_weight": 0.3},
+    "encoder": {
+        "loss": "autoencoder",
+        "intensity": "linear",
+        "optimizer": "adam",
+        "threshold_angle_deg": 3.0,
+        "wide_weight": 0.3,
+    },
     "env": {"target": "random"},
     "random_search": {"num_wide": 0},
     "cma_es": {"constraint": "bounds"},
