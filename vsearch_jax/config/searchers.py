@@ -56,11 +56,11 @@ class SACConfig:
     """Number of policies trained side by side. Each one has its own random numbers."""
     num_envs: int = 16
     """Number of environments that a policy steps at once."""
-    num_environment_steps: int = 10_240
+    num_environment_steps: int = 5_120
     """Number of environment steps of each policy, summed over its environments."""
     num_warmup_steps: int = 512
     """Number of environment steps before the first update. Their actions are uniformly random."""
-    updates_per_step: float = 2.0
+    updates_per_step: float = 1.0
     """Number of updates for each environment step."""
     batch_size: int = 256
     """Number of transitions in an update."""
