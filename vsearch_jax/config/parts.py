@@ -57,7 +57,7 @@ class EncoderConfig:
     input: Literal["rgb", "depth", "silhouette"] = "rgb"
     """Part of the image that the encoder reads."""
     intensity: Literal["linear", "log"] = "log"
-    """Scale of rgb in the first layer. log: a shadow is an offset, which a filter can ignore. Else it has no effect."""
+    """Scale on which the network reads rgb. On log a shadow is an offset, which filters can ignore. Depth is linear."""
     code_size: int = 128
     """Number of entries in the code."""
     channels: tuple[int, ...] = (64, 128, 128)
