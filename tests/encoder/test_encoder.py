@@ -116,7 +116,7 @@ def test_a_shadow_is_an_offset_only_of_the_logarithm_of_rgb(intensity, kind):
     if kind == "rgb" and intensity == "log":
         assert change < 0.15
     else:
-        np.testing.assert_allclose(change, 0.5, atol=0.02)  # layers without biases are linear in a positive factor
+        np.testing.assert_allclose(change, 0.5, atol=0.02)  # with biases of 0, layers are linear in a positive factor
 
 
 # -- loss and whitening ---------------------------------------------------------------------------------------------

@@ -75,7 +75,7 @@ class EncoderConfig:
     optimizer: Literal["adam", "muon"] = "muon"
     """muon: orthogonal steps for matrices and kernels, Adam for biases. adam: Adam for all parameters (thesis)."""
     learning_rate: float = 8e-3
-    """Highest step size of the optimizer. It decays to zero along a cosine."""
+    """Highest step size of the optimizer; about 0.001 suits adam. It decays to zero along a cosine."""
     bootstrap_fraction: float = 0.25
     """Fraction of the pixels that enter the loss. They are the pixels with the largest error."""
     whitening_power: float = 0.0
