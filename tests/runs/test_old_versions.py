@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import flax.struct
@@ -7,6 +8,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
+from vsearch_jax import encoder, runs
 from vsearch_jax.config import Config
 from vsearch_jax.runs import checkpoint
 from vsearch_jax.runs.checkpoint import CheckpointError
@@ -99,3 +101,14 @@ def test_the_version_of_an_old_checkpoint_that_does_not_fit_is_named(tmp_path: P
 def test_names_of_a_version_without_renames_stay() -> None:
     names = ["env.pipeline_state.sight.qpos", "replay.data.truncated"]
     assert current_names(names, "0.2.0") == {name: name for name in names}
+
+
+def test_the_encoder_of_a_run_of_version_0_2_0_has_the_arrays_that_this_version_stored(tmp_path: Path) -> None:
+    # Written by 0.2.0: config.json of its preset `cpu`, and names and shapes of the encoder in its checkpoints.
+    stored = json.loads((Path(__file__).parent / "run_of_0_2_0.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(stored["config"]))
+    config = runs.read_config(tmp_path)
+    state = jax.eval_shape(lambda: encoder.init(jax.random.key(0), config))
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    arrays = {jax.tree_util.keystr(path, simple=True, separator="."): list(leaf.shape) for path, leaf in leaves}
+    assert arrays == stored["encoder"]

@@ -66,6 +66,8 @@ class EncoderConfig:
     """Stride of the first convolution: 2, or 4 (8x8 kernel). Stride 4 takes 1/3 of the time of two of stride 2."""
     kernel_size: int = 3
     """Height and width of the kernels of stride-2 convolutions, in pixels."""
+    hidden_sizes: tuple[int, ...] = (256,)
+    """Number of units of each dense layer between the convolutions and the code. Thesis: none."""
     decoder_size: int = 64
     """Height and width of the decoder's image, in pixels."""
     num_updates: int = 500
@@ -99,6 +101,7 @@ class EncoderConfig:
             len(self.channels) >= 2 and all(c > 0 for c in self.channels),
             "at least two counts, all greater than 0",
         )
+        require(self, "hidden_sizes", all(size > 0 for size in self.hidden_sizes), "counts greater than 0, or none")
         require(
             self,
             "decoder_size",

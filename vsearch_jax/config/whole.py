@@ -98,7 +98,9 @@ PRESETS: dict[str, Config] = {
     "smoke": Config(
         scene=SceneConfig(image_size=32),
         ik=IKConfig(map_azimuths=12, map_elevations=7, map_seeds=16),
-        encoder=EncoderConfig(channels=(8, 16), decoder_size=16, num_updates=8, batch_size=8, pool_size=32),
+        encoder=EncoderConfig(
+            channels=(8, 16), hidden_sizes=(32,), decoder_size=16, num_updates=8, batch_size=8, pool_size=32
+        ),
         sac=SACConfig(num_envs=4, num_environment_steps=64, num_warmup_steps=16, batch_size=32, hidden_sizes=(32, 32)),
         evaluation=EvaluationConfig(num_initial_views=4, num_runs=1, num_episodes=8, batch_size=8),
         num_chunks=4,
@@ -112,6 +114,7 @@ PRESETS: dict[str, Config] = {
             channels=(128, 256, 256, 512),
             stem_stride=2,
             kernel_size=5,
+            hidden_sizes=(),
             decoder_size=128,
             num_updates=30_000,
             batch_size=64,

@@ -123,7 +123,7 @@ class Encoder(nnx.Module):
         """Draws the parameters.
 
         Args:
-          config: kind of input, channels, kernel size, strides and code size.
+          config: kind of input, channels, kernel size, strides, hidden sizes and code size.
           image_size: height and width of the image in pixels.
           rngs: random numbers for the parameters.
         """
@@ -134,7 +134,12 @@ class Encoder(nnx.Module):
         layers = zip(inputs, config.channels, sizes, strides, strict=True)
         self.convolutions = nnx.List([StridedConvolution(*layer, rngs=rngs) for layer in layers])
         cells = (image_size // math.prod(strides)) ** 2
-        self.dense = nnx.Linear(cells * config.channels[-1], config.code_size, rngs=rngs)
+        widths = (cells * config.channels[-1], *config.hidden_sizes)
+        he_normal = jax.nn.initializers.he_normal()
+        self.hidden = nnx.List(
+            [nnx.Linear(a, b, kernel_init=he_normal, rngs=rngs) for a, b in itertools.pairwise(widths)]
+        )
+        self.dense = nnx.Linear(widths[-1], config.code_size, rngs=rngs)
         self.is_log = config.input == "rgb" and config.intensity == "log"
 
     def __call__(self, x: Array) -> Array:
@@ -143,7 +148,10 @@ class Encoder(nnx.Module):
             x = jnp.log1p(x / _LOG_FLOOR) - _LOG_OFFSET
         for convolution in self.convolutions:
             x = jax.nn.relu(convolution(x))
-        return self.dense(x.reshape(-1))
+        x = x.reshape(-1)
+        for hidden in self.hidden:
+            x = jax.nn.relu(hidden(x))
+        return self.dense(x)
 
 
 class Decoder(nnx.Module):

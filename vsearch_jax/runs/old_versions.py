@@ -29,6 +29,7 @@ _LATER_FIELDS: dict[str, dict[str, object]] = {
         "loss": "autoencoder",
         "intensity": "linear",
         "optimizer": "adam",
+        "hidden_sizes": [],
         "threshold_angle_deg": 3.0,
         "wide_weight": 0.3,
     },
