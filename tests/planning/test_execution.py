@@ -66,12 +66,10 @@ def moves():
     return _execute_moves(4)
 
 
-@pytest.mark.slow
 def test_the_arm_ends_at_the_planned_view(moves):
     _check(moves, 1.0)
 
 
-@pytest.mark.slow
 def test_c_mujoco_makes_the_same_motion_without_contact(moves):
     scene, arm, paths, trajectories, done, _, _, _ = moves
     model, oracle = scene.mj_model, ContactOracle(scene)

@@ -167,12 +167,11 @@ def _measure(env: ViewSearchEnv, episode: _Episode, loop: _Loop) -> tuple[Outcom
     progress, help_ = loop
     result, last = policy.episode_result(progress), episode_of(progress.state)
     travel, duration = progress.costs
-    outcome = measure_outcome(env, result, last.observation.camera, last.target.camera) | {
+    outcome = measure_outcome(env, result, last.observation, last.target) | {
         "joint_travel": travel,
         "motion_time": duration,
         "num_plans": result.evaluations,
         "initial_view": jax.tree.map(lambda x: x[0], episode.ends.view),
-        "target_view": last.target.view,
     }
     return outcome, help_.num_stalled
 

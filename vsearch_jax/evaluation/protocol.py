@@ -48,6 +48,8 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
       - `joint_travel` f32 rad and `motion_time` f32 s, sums over all motions.
       - `num_plans` i32: motions requested. Each image but that of the initial view needs one.
       - `initial_view` and `target_view`: View of f32 rad.
+      - `final_qpos` and `target_qpos` f32[..., nq] rad or m: joints at the view that the search ends with, which is the
+        best one of a black-box search; and joints from which the target image was taken.
       - `num_wide` i32 of `random_search`: how often a wide sample became the best view.
       - `num_restarts` i32 of `cma_es_restarts`.
       - `unreachable_by_generation` i32[..., G] of both forms of CMA-ES: samples that the arm could not reach.

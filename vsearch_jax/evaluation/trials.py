@@ -15,7 +15,7 @@ from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
 from vsearch_jax.search.common import is_running, taken_images, to_result
-from vsearch_jax.types import Camera, Observation, View
+from vsearch_jax.types import Observation, View
 from vsearch_jax.xla import lane_pool
 from vsearch_jax.xla.tree import tree_where, tree_zeros
 
@@ -60,14 +60,14 @@ class _Trial(NamedTuple):
 
     Attributes:
       states: one state for each searcher; only the state of the running searcher changes.
-      camera: Camera at the best view.
+      best: Observation from the best view.
       qpos: f32[nq] rad or m, present joints of the arm.
       costs: f32[2], travel in rad and duration in s, summed over the motions so far.
       is_over: bool[], the search has ended.
     """
 
     states: tuple[object, ...]
-    camera: Camera
+    best: Observation
     qpos: Array
     costs: Array
     is_over: Array
@@ -114,18 +114,17 @@ def search_trials(
     )
     trials = lane_pool.run(job, problems, lane_pool.queue_where(jnp.ones(numbers.size, bool)), lanes, trials)
 
-    target_views = jax.tree.map(lambda x: jnp.broadcast_to(x, shape[1:]), target.view)
     measure = jax.vmap(functools.partial(measure_outcome, env), in_axes=(0, 0, None))
     outcomes: list[Outcome] = []
     for number, method in enumerate(methods):
-        own = (trials.states[number], trials.camera, trials.costs)
+        own = (trials.states[number], trials.best, trials.costs)
         rows = slice(number * shape[1], (number + 1) * shape[1])
-        states, camera, costs = jax.tree.map(lambda x, rows=rows: x[rows], own)
+        states, best, costs = jax.tree.map(lambda x, rows=rows: x[rows], own)
         result = jax.vmap(to_result)(method.record(states))
         # The image of the initial view needs no motion.
         motions = {"joint_travel": costs[:, 0], "motion_time": costs[:, 1], "num_plans": result.evaluations - 1}
-        views: Outcome = {"initial_view": initial.view, "target_view": target_views}
-        outcomes.append(measure(result, camera, target.camera) | jax.vmap(method.counts)(states) | motions | views)
+        views: Outcome = {"initial_view": initial.view}
+        outcomes.append(measure(result, best, target) | jax.vmap(method.counts)(states) | motions | views)
     return outcomes
 
 
@@ -139,7 +138,7 @@ def _start_trial(bench: _Bench, problem: _Problem) -> _Trial:
     args = _search_args(bench, problem)
     states = tuple(method.start(args, problem.score) for method in bench.methods)
     is_over = _is_over(bench, problem, states)
-    return _Trial(states, problem.start.camera, problem.start.qpos, jnp.zeros(2), is_over)
+    return _Trial(states, problem.start, problem.start.qpos, jnp.zeros(2), is_over)
 
 
 def _is_over(bench: _Bench, problem: _Problem, states: tuple[object, ...]) -> Array:
@@ -177,9 +176,9 @@ def _run_generation(bench: _Bench, problem: _Problem, trial: _Trial) -> _Trial:
     is_moved = motions.is_found & taken_images(scores, args.threshold) & is_requested
     qpos, costs = _add_motion_costs(bench.env, trial, observations.qpos, motions._replace(is_found=is_moved))
     states, best = jax.lax.switch(problem.number, [functools.partial(tell, i) for i in numbers], states, views, scores)
-    best_camera = jax.tree.map(lambda x: x[best], observations.camera)
-    camera = tree_where(best >= 0, best_camera, trial.camera)
-    return _Trial(states, camera, qpos, costs, _is_over(bench, problem, states))
+    best_of_generation = jax.tree.map(lambda x: x[best], observations)
+    best_so_far = tree_where(best >= 0, best_of_generation, trial.best)
+    return _Trial(states, best_so_far, qpos, costs, _is_over(bench, problem, states))
 
 
 def _observe_generation(
