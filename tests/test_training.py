@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import vsearch_jax as vs
+from vsearch_jax import encoder as encoders
 from vsearch_jax.runs import checkpoint
 from vsearch_jax.runs.old_versions import current_names
+from vsearch_jax.training import encoder_iteration, with_encoder
 from vsearch_jax.training import run as training
-from vsearch_jax.training import with_encoder
 
 # Silhouettes need no light, which takes half of the renderer's compile time.
 SMOKE = vs.Config.preset("smoke")
@@ -91,6 +93,40 @@ def test_encoder_changes_in_its_stage_and_stays_in_the_policy_stage():
             after = arrays(state.encoder)
             assert all((before[path] == after[path]).all() for path in before)
     assert num_policy_chunks > 0
+
+
+def test_the_encoder_learns_to_tell_views_apart_that_it_was_not_trained_on():
+    encoder = dataclasses.replace(CONFIG.encoder, num_updates=200, batch_size=32)
+    config = dataclasses.replace(CONFIG, encoder=encoder)
+    untrained = encoders.init(jax.random.key(0), config)
+    env = vs.ViewSearchEnv(config, untrained)
+
+    def update(i, encoder):
+        return encoder_iteration(i, encoder, env=env, key=jax.random.key(1))[0]
+
+    @jax.jit
+    def observe(key):
+        view, qpos = env.random_view(key)
+        return env.wrist_image(env.resolve_view(view, qpos, jnp.bool_(False))[1])
+
+    @jax.jit
+    def encode(encoder, image):
+        return encoders.encode(encoder, encoders.network_input(image, env.scene.object_geom_ids, config), config)
+
+    trained = jax.jit(lambda start: jax.lax.fori_loop(0, encoder.num_updates, update, start))(untrained)
+    cameras, images = zip(*(observe(key) for key in jax.random.split(jax.random.key(2), 100)), strict=True)
+    turns = Rotation.from_matrix(np.array([camera.rotation for camera in cameras]))
+    angles = np.rad2deg([(turns[i].inv() * turns).magnitude() for i in range(100)])
+    is_far, is_near = angles > 15.0, (angles > 0.0) & (angles < 3.0)
+    best_wrong = []
+    for state in (untrained, trained):
+        codes = np.array([encode(state, image) for image in images])
+        codes /= np.linalg.norm(codes, axis=1, keepdims=True)
+        cosines = codes @ codes.T
+        best_wrong.append(np.median(np.where(is_far, cosines, -1.0).max(axis=1)))
+    assert best_wrong[0] > 0.85
+    assert best_wrong[1] < 0.8
+    assert cosines[is_near].mean() > 0.97  # the wanted cosine is 0.98 or more up to 3 degrees
 
 
 def test_policies_start_with_the_encoder_of_another_run_and_a_fixed_target(chunked):
