@@ -104,7 +104,8 @@ def dynamics_section(kinematic: Results, dynamic: Results, moves: dict[str, Any]
 
 def sections() -> dict[str, str]:
     """Returns the generated sections of README.md by name. A section without files is empty."""
-    files = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.json"))}
+    paths = sorted(FOLDER.glob("*.json"), key=lambda path: path.stem)
+    files = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
     others = {name: results for name, results in files.items() if name not in (MAIN, DYNAMIC, MOVES)}
     has_dynamic = DYNAMIC in files
     return {
