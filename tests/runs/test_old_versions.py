@@ -16,6 +16,8 @@ from vsearch_jax.runs.old_versions import current_names
 
 CONFIG = Config.preset("smoke")
 STEP = 7
+RUN_OF_0_2_0 = Path(__file__).parents[1] / "samples" / "run_of_0_2_0.json"
+"""Written by 0.2.0: config.json of its preset `cpu`, and names and shapes of the encoder in its checkpoints."""
 
 
 @flax.struct.dataclass
@@ -104,8 +106,7 @@ def test_names_of_a_version_without_renames_stay() -> None:
 
 
 def test_the_encoder_of_a_run_of_version_0_2_0_has_the_arrays_that_this_version_stored(tmp_path: Path) -> None:
-    # Written by 0.2.0: config.json of its preset `cpu`, and names and shapes of the encoder in its checkpoints.
-    stored = json.loads((Path(__file__).parent / "run_of_0_2_0.json").read_text())
+    stored = json.loads(RUN_OF_0_2_0.read_text())
     (tmp_path / "config.json").write_text(json.dumps(stored["config"]))
     config = runs.read_config(tmp_path)
     state = jax.eval_shape(lambda: encoder.init(jax.random.key(0), config))

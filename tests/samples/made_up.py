@@ -36,6 +36,8 @@ def trials(shape: tuple[int, ...], generations: int, seed: int = 0) -> dict[str,
         "num_plans": random.integers(1, 10 * generations, shape).astype(np.int32),
         "initial_view": view,
         "target_view": view,
+        "final_qpos": random.random((*shape, 7)).astype(np.float32),
+        "target_qpos": random.random((*shape, 7)).astype(np.float32),
     }
 
 

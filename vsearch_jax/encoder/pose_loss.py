@@ -73,8 +73,7 @@ def view_angles(rotations: Array, order: int) -> Array:
 def pose_loss(latents: Array, angles: Array, config: Config) -> Array:
     """Computes the pose loss of a batch: squared differences of cosines from the wanted ones.
 
-    Near pairs are rare among random views. So the mean over near pairs, with a weight of 4, and the mean over far pairs
-    are added.
+    Near pairs are rare among random views. So the weighted mean over near pairs and the mean over far pairs are added.
 
     Args:
       latents: f32[B, Z], raw latents of B views, Z numbers each.
