@@ -33,7 +33,13 @@ from vsearch_jax.types import EncoderState, ReachabilityMap
 
 UPDATES = {"pose": 500, "autoencoder": 275, "both": 260}
 """Updates of each loss. They shall take about equal time; each row holds its seconds."""
-THESIS = {"optimizer": "adam", "intensity": "linear", "learning_rate": 1e-3, "hidden_sizes": ()}
+THESIS = {
+    "optimizer": "adam",
+    "intensity": "linear",
+    "learning_rate": 1e-3,
+    "channels": (64, 128, 128),
+    "hidden_sizes": (),
+}
 """Fields of the encoder's config for the autoencoder: trained as the thesis does, at our higher step size."""
 OBJECTS = ("teapot", "truck", "bracket", "part:plate", "part:bracket", "part:gear")
 SHOWN = {

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from vsearch_jax import encoder as encoders
 from vsearch_jax.config import PRESETS, Config, ConfigError, EncoderConfig
 from vsearch_jax.encoder import fit, network
+from vsearch_jax.encoder.convolution import convolution_by_matmul, convolution_by_xla, convolution_for_cpu
 from vsearch_jax.types import Image
 
 INPUTS = ("rgb", "depth", "silhouette")
@@ -30,8 +31,9 @@ def smoke_config(**encoder):
 # -- layers ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("convolution", [convolution_by_matmul, convolution_for_cpu])
 @pytest.mark.parametrize(("kernel_size", "stride"), [(3, 2), (5, 2), (8, 4)])
-def test_both_convolutions_and_their_gradients_agree(kernel_size, stride):
+def test_our_convolutions_and_their_gradients_equal_xla(convolution, kernel_size, stride):
     x_key, kernel_key, weight_key = jax.random.split(jax.random.key(kernel_size), 3)
     x = jax.random.normal(x_key, (2, 16, 24, 3))
     kernel = jax.random.normal(kernel_key, (kernel_size, kernel_size, 3, 5))
@@ -42,13 +44,11 @@ def test_both_convolutions_and_their_gradients_agree(kernel_size, stride):
 
     for argument in (0, 1):
         ours, xla = (
-            jax.jit(jax.grad(functools.partial(total, convolution), argnums=argument))(x, kernel)
-            for convolution in (network.convolution_by_matmul, network.convolution_by_xla)
+            jax.jit(jax.grad(functools.partial(total, function), argnums=argument))(x, kernel)
+            for function in (convolution, convolution_by_xla)
         )
         np.testing.assert_allclose(ours, xla, rtol=1e-4, atol=1e-3)
-    ours, xla = (
-        convolution(x[0], kernel, stride) for convolution in (network.convolution_by_matmul, network.convolution_by_xla)
-    )
+    ours, xla = (function(x[0], kernel, stride) for function in (convolution, convolution_by_xla))
     assert ours.shape == (16 // stride, 24 // stride, 5)
     np.testing.assert_allclose(ours, xla, rtol=1e-4, atol=1e-4)
 

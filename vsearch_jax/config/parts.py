@@ -60,7 +60,7 @@ class EncoderConfig:
     """Scale on which the network reads rgb. On log a shadow is an offset, which filters can ignore. Depth is linear."""
     code_size: int = 128
     """Number of entries in the code."""
-    channels: tuple[int, ...] = (64, 128, 128)
+    channels: tuple[int, ...] = (64, 128, 128, 128)
     """Number of filters of each convolution. All but the first halve height and width. The decoder mirrors them."""
     stem_stride: int = 4
     """Stride of the first convolution: 2, or 4 (8x8 kernel). Stride 4 takes 1/3 of the time of two of stride 2."""

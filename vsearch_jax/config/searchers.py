@@ -56,7 +56,7 @@ class SACConfig:
     """Number of policies trained side by side. Each one has its own random numbers."""
     num_envs: int = 16
     """Number of environments that a policy steps at once."""
-    num_environment_steps: int = 5_120
+    num_environment_steps: int = 6_400
     """Number of environment steps of each policy, summed over its environments."""
     num_warmup_steps: int = 512
     """Number of environment steps before the first update. Their actions are uniformly random."""

@@ -105,7 +105,7 @@ PRESETS: dict[str, Config] = {
         evaluation=EvaluationConfig(num_initial_views=4, num_runs=1, num_episodes=8, batch_size=8),
         num_chunks=4,
     ),
-    "cpu": Config(sac=SACConfig(num_seeds=3), num_chunks=41),
+    "cpu": Config(num_chunks=45),
     "thesis": Config(
         encoder=EncoderConfig(
             loss="autoencoder",
