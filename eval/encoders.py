@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import json
 import os
 import shlex
@@ -23,6 +24,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before jax is imported
 
 import jax
 import numpy as np
+from jax.stages import Compiled
 
 import vsearch_jax as vs
 from encoder_sections.images import FULL, QUICK, encode_views, train_encoder
@@ -138,14 +140,20 @@ def measure_encoder(config: vs.Config, seed: int, is_quick: bool) -> dict[str, f
       seed: seed of all random numbers.
       is_quick: small sizes.
     """
-    env = vs.ViewSearchEnv(config)
-    train_key = jax.random.key(seed)
-    compiled = train_encoder.lower(train_key, env.reach, config).compile()
+    compiled, reach = _compile_training(config)
     began = time.perf_counter()
-    encoder = jax.block_until_ready(compiled(train_key, env.reach))
+    encoder = jax.block_until_ready(compiled(jax.random.key(seed), reach))
     seconds = time.perf_counter() - began
-    measured = _measure(encoder, env.reach, config, seed, is_quick)
+    measured = _measure(encoder, reach, config, seed, is_quick)
     return measured | {"train_seconds": seconds, "num_updates": config.encoder.num_updates}
+
+
+@functools.lru_cache(maxsize=1)
+def _compile_training(config: vs.Config) -> tuple[Compiled, ReachabilityMap]:
+    """Compiles the training of `config` for all seeds. What was compiled for another config is released."""
+    jax.clear_caches()
+    reach = vs.ViewSearchEnv(config).reach
+    return train_encoder.lower(jax.random.key(0), reach, config).compile(), reach
 
 
 def _measure(
