@@ -33,7 +33,7 @@ from parts import PARTS, write_part
 from vsearch_jax import report, runs
 from vsearch_jax.types import EncoderState, ReachabilityMap
 
-UPDATES = {"pose": 500, "autoencoder": 275, "both": 260}
+UPDATES = {"pose": 500, "autoencoder": 540, "both": 260}
 """Updates of each loss. They shall take about equal time; each row holds its seconds."""
 THESIS = {
     "optimizer": "adam",
