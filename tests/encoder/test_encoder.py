@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from vsearch_jax import encoder as encoders
 from vsearch_jax.config import PRESETS, Config, ConfigError, EncoderConfig
 from vsearch_jax.encoder import fit, network
-from vsearch_jax.encoder.convolution import convolution_by_matmul, convolution_by_xla, convolution_for_cpu
+from vsearch_jax.encoder.convolution import convolution_by_matmul, convolution_by_xla, convolve
 from vsearch_jax.types import Image
 
 INPUTS = ("rgb", "depth", "silhouette")
@@ -31,7 +31,7 @@ def smoke_config(**encoder):
 # -- layers ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("convolution", [convolution_by_matmul, convolution_for_cpu])
+@pytest.mark.parametrize("convolution", [convolution_by_matmul, convolve])
 @pytest.mark.parametrize(("kernel_size", "stride"), [(3, 2), (5, 2), (8, 4)])
 def test_our_convolutions_and_their_gradients_equal_xla(convolution, kernel_size, stride):
     x_key, kernel_key, weight_key = jax.random.split(jax.random.key(kernel_size), 3)

@@ -16,7 +16,7 @@ from flax import nnx
 from jax import Array
 
 from vsearch_jax.config import Config, EncoderConfig
-from vsearch_jax.encoder.convolution import convolution_by_xla, convolution_for_cpu
+from vsearch_jax.encoder.convolution import convolve
 from vsearch_jax.types import EncoderState, Image, ParamTree
 
 _LOG_FLOOR, _LOG_OFFSET = 0.05, 2.2
@@ -43,9 +43,7 @@ class StridedConvolution(nnx.Module):
 
     def __call__(self, x: Array) -> Array:
         """Returns f32[H/s, W/s, K] from `x` f32[H, W, C]."""
-        convolution = convolution_for_cpu if jax.default_backend() == "cpu" else convolution_by_xla
-        y: Array = convolution(x, self.kernel[...], self.stride)  # custom_vjp hides the type
-        return y + self.bias[None, None]
+        return convolve(x, self.kernel[...], self.stride) + self.bias[None, None]
 
 
 class SubPixelUpsampling(nnx.Module):
