@@ -91,7 +91,7 @@ def main(arguments: list[str]) -> None:
                 print(f"{name}, {loss}, seed {seed}: {row['train_seconds']:.0f} s", flush=True)
     found = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(rows.glob("*.json"))]
     command = shlex.join(["python", "eval/encoders.py", *arguments])
-    content = {"command": command, "versions": report.versions(), "rows": found}
+    content = {"command": command, **report.provenance(), "rows": found}
     runs.write_atomically(options.out / "encoders.json", json.dumps(content, indent=1) + "\n")
     runs.write_atomically(options.out / "encoders.md", to_markdown(content))
     print(f"wrote {options.out / 'encoders.md'}")

@@ -30,7 +30,7 @@ def evaluate(run: Path, out: Path, episodes: int, target_deg: tuple[float, float
     Args:
       run: folder of a finished run.
       out: folder of the results; must be empty or not exist.
-      episodes: episodes of each policy; a multiple of `batch_size`.
+      episodes: episodes of each policy.
       target_deg: azimuth and elevation of the target view of random search and CMA-ES, in degrees.
       batch_size: episodes that run side by side.
     """

@@ -53,7 +53,7 @@ def main(arguments: list[str]) -> None:
     moved = is_found & (seconds > 0.0)
     content = {
         "command": shlex.join(["python", "eval/moves.py", *arguments]),
-        "versions": report.versions(),
+        **report.provenance(),
         "arm": options.arm,
         "motions": options.count,
         "planned": int(is_found.sum()),

@@ -44,7 +44,8 @@ def results_section(results: Results) -> str:
     for seed in results["sac"]["seeds"]:
         lines.append(
             f"- **Policy {seed['seed']} alone**: pose success {100 * seed['pose_success_rate']:.2f} %, "
-            f"{seed['evaluations_mean']:.2f} steps, {seed['evaluations_over_lower_bound']:.3f} times the lower bound."
+            f"{seed['evaluations_mean']:.2f} steps, {seed['evaluations_over_lower_bound']:.3f} times the estimate of "
+            "the lower bound."
         )
     seconds = results["wall_seconds"]
     stages = ", ".join(f"{stage} {value:.0f} s" for stage, value in seconds.items())

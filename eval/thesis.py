@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> None:
         "table_5_2": tables.table_5_2(searches["penalty"]),
         "config": config.to_dict(),
         "thesis_policy_config": thesis_config.to_dict(),
-        "versions": report.versions(),
+        **report.provenance(),
     }
     _write(options.out, content, drawn)
     print(f"wrote {options.out / 'thesis.md'}")

@@ -62,6 +62,8 @@ def test_a_run_writes_every_file_of_its_folder(fast: None, capsys: pytest.Captur
     assert set(results["wall_seconds"]) == {*STAGES, "evaluation"}
     printed = capsys.readouterr().out
     assert "SAC policy alone" in printed and f"{config.num_iterations}/{config.num_iterations} policy" in printed
+    assert "false matches 0.25, angle at the threshold (°) 3.5" in printed
+    assert re.search(r"policy, .* pose success 0\.\d+\n", printed)
 
 
 def test_a_folder_with_files_is_not_used(fast: None, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -170,3 +172,29 @@ def test_a_full_disk_is_one_line_and_keeps_what_was_saved(tmp_path: Path, file_l
     assert done.stderr.count("\n") == 1, done.stderr
     assert any(out.iterdir()) == is_started
     assert checkpoint.latest_step(out) == (24 if is_started else None)
+
+
+def test_wrong_views_are_the_last_words(
+    fast: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def evaluate(*_: Any) -> dict[str, Any]:
+        results = made_up.evaluation()
+        results["random_search"]["is_false_positive"] = results["random_search"]["is_success"]
+        return results
+
+    monkeypatch.setattr(loop, "evaluate", evaluate)
+    main(["train", "--preset", "smoke", "--out", str(tmp_path / "run")])
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert re.match(r"Wrong views were found: more than 10° .*Random search \d+\.\d %", last)
+    assert "Train with --encoder.num-updates above 8." in last and "--scene.symmetry N" in last
+
+
+def test_the_symmetry_of_the_object_is_said_and_noted(
+    fast: None, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    main(["train", "--preset", "smoke", "--out", str(out), "--scene.symmetry", "4"])
+    sentence = "The object counts as equal after each of 4 equal turns about the vertical"
+    assert capsys.readouterr().out.count(sentence) == 2  # before the training, and below the table
+    assert json.loads((out / "results.json").read_text())["symmetry"] == 4
+    assert sentence in (out / "report.html").read_text()

@@ -34,6 +34,7 @@ CONTRACT = {
     "rotation_error_deg_mean",
     "rotation_error_deg_median",
     "translation_error_cm_mean",
+    "mssd_cm_mean",
     "false_positive_rate",
     "unreachable_rate",
     "joint_travel_rad_mean",
@@ -80,7 +81,7 @@ def test_results_have_the_keys_of_the_contract(results: dict[str, Any]) -> None:
     for name in POLICIES:
         wanted = {"steps_lower_bound_mean", "below_bound_rate", "environment_steps", "images_rendered", "seeds"}
         assert results[name].keys() >= wanted
-    assert results.keys() >= {"thesis", "versions", "wall_seconds"}
+    assert results.keys() >= {"thesis", "config", "commit", "versions", "machine", "wall_seconds"}
     assert [seed["seed"] for seed in results["sac"]["seeds"]] == [0, 1, 2]
     assert all(seed.keys() >= CONTRACT for seed in results["sac"]["seeds"])
     json.dumps(results, allow_nan=False)
@@ -138,6 +139,7 @@ def test_help_that_was_never_needed_is_reported_as_zero(arrays: dict[str, Any]) 
 def test_what_helps_a_searcher_is_counted(results: dict[str, Any]) -> None:
     assert results["random_search"]["wide_rate"] == pytest.approx(2 / 3)
     assert results["cma_es_restarts"]["restarts_mean"] == pytest.approx(1.0)
+    assert results["cma_es_restarts"]["scan_images_mean"] == pytest.approx(21.0)
     assert results["cma_es"].keys() & {"wide_rate", "restarts_mean"} == set()
 
 
@@ -174,7 +176,7 @@ def test_table_shows_ours_beside_the_thesis(results: dict[str, Any]) -> None:
 
 def test_report_writes_results_figures_and_one_page(tmp_path: Path, evaluated: Evaluated) -> None:
     results = report.write_report(tmp_path, evaluated, CONFIG)
-    assert results["seed"] == 7
+    assert (results["seed"], results["symmetry"]) == (7, 1)
     assert json.loads((tmp_path / "results.json").read_text()) == json.loads(json.dumps(results))
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == len(CAPTIONS) == 8

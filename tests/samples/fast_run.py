@@ -53,6 +53,8 @@ def _train(state: State, config: Config) -> tuple[State, dict[str, jax.Array]]:
         if name != "value_loss"  # NaN without a value network
     }
     metrics["encoder_loss"] = jnp.where(is_encoder, state.weights[:length] ** 2, jnp.nan)
+    metrics["false_match_rate"] = jnp.where(is_encoder, 0.25, jnp.nan)
+    metrics["threshold_angle_deg"] = jnp.where(is_encoder, 3.5, jnp.nan)
     metrics["stage"] = jnp.where(is_encoder, 0, 1).astype(jnp.int32)
     step = jnp.minimum(state.step + length, config.num_iterations)
     return State(jnp.sin(state.weights + noise), state.reach, state.key, step), metrics

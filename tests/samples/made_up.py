@@ -28,6 +28,7 @@ def trials(shape: tuple[int, ...], generations: int, seed: int = 0) -> dict[str,
         "rotation_error": rotation,
         "frobenius_angle": rotation / 2,
         "translation_error": 0.35 * rotation,
+        "surface_distance": 0.1 * rotation,
         "is_false_positive": is_success & (rotation > np.deg2rad(10)),
         "unreachable": random.integers(0, 2, shape).astype(np.int32),
         "best_scores": best,
@@ -50,7 +51,7 @@ def evaluation(num_seeds: int = 1) -> dict[str, Any]:
     return {
         "random_search": trials((24,), 30) | {"num_wide": count},
         "cma_es": trials((24,), 30, 1),
-        "cma_es_restarts": trials((24,), 30, 2) | {"num_restarts": count},
+        "cma_es_restarts": trials((24,), 30, 2) | {"num_restarts": count, "scan_images": 20 + count},
         "sac": policies,
         "sac_assisted": policies | {"num_helped": (np.arange(np.prod(shape)).reshape(shape) % 4 == 0).astype(np.int32)},
     }

@@ -82,7 +82,7 @@ def training_progress(console: Console, config: Config, step: int) -> Iterator[T
 
 
 def summarize_chunk(seconds: float, lines: Sequence[MetricsLine]) -> str:
-    """Describes a chunk of iterations in one line: stage, iterations a second, means of loss, reward and success.
+    """Describes a chunk of iterations in one line: stage, iterations a second, means of loss, reward and pose success.
 
     Args:
       seconds: wall time of the chunk in s.
@@ -98,7 +98,7 @@ def summarize_chunk(seconds: float, lines: Sequence[MetricsLine]) -> str:
         "false matches": "false_match_rate",
         "angle at the threshold (°)": "threshold_angle_deg",
         "reward": "reward",
-        "success": "success_rate",
+        "pose success": "pose_success_rate",
     }
     for name, key in shown.items():
         values = [line[key] for line in lines if key in line]

@@ -18,6 +18,7 @@ from vsearch_jax.export import stablehlo
 from vsearch_jax.runs import loop
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.folder import RunError, check_new_file, lock_folder, make_new_folder, read_config, read_seed
+from vsearch_jax.scene import build_scene, describe_symmetry
 from vsearch_jax.types import TrainState
 
 
@@ -49,6 +50,8 @@ def _train(command: Train) -> None:
     with lock_folder(run):
         with console.status("building the scene, computing what the arm reaches"):
             state = _resume(command) if command.resume else _start(command)
+        if sentence := describe_symmetry(build_scene(config.scene).symmetry):
+            console.print(sentence, highlight=False, soft_wrap=True)
         with training_progress(console, config, int(state.step)) as progress:
             state = loop.train_to_end(run, state, config, progress.update, progress.announce_stop)
         _evaluate(run, state, config, console, out=run)
@@ -104,7 +107,11 @@ def _evaluate(run: Path, state: TrainState, config: Config, console: Console, *,
     with console.status("evaluating every searcher"):
         summary = report.write_report(out, loop.evaluate_run(run, state, config), config)
     report.print_table(summary, console)
+    if sentence := describe_symmetry(summary["symmetry"]):
+        console.print(sentence, highlight=False, soft_wrap=True)
     console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True)
+    if (warning := report.false_positive_warning(summary)) is not None:
+        console.print(warning, style="bold red", highlight=False, soft_wrap=True)
 
 
 def _finished_state(run: Path, config: Config) -> TrainState:

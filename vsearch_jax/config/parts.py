@@ -93,6 +93,8 @@ class EncoderConfig:
         require(self, "threshold_angle_deg", 0.0 < self.threshold_angle_deg <= 30.0, "greater than 0, at most 30")
         require(self, "wide_weight", 0.0 <= self.wide_weight <= 0.9, "from 0 to 0.9")
         require_positive(self, "code_size", "num_updates", "batch_size", "learning_rate", "decoder_size")
+        has_pairs = self.loss == "autoencoder" or self.batch_size >= 4
+        require(self, "batch_size", has_pairs, "4 or more, because the pose loss compares pairs of views")
         require(self, "kernel_size", self.kernel_size in (3, 5), "3 or 5")
         require(self, "stem_stride", self.stem_stride in (2, 4), "2 or 4")
         require(
@@ -164,7 +166,7 @@ class EvaluationConfig:
     num_runs: int = 10
     """Number of runs from each initial view."""
     num_episodes: int = 1000
-    """Number of episodes of each policy. Initial view and target of an episode are random."""
+    """Number of episodes of each policy. The initial view is random, and the target as `env.target` says."""
     patience: int = 7
     """Number of steps before a local search helps a stalled policy. Near the target, one step of stalling is enough."""
     batch_size: int = 125
@@ -178,9 +180,3 @@ class EvaluationConfig:
             self, "num_initial_views", self.num_initial_views > 0 and self.num_initial_views % 4 == 0, "a multiple of 4"
         )
         require(self, "target_elevation_deg", -90.0 <= self.target_elevation_deg <= 90.0, "from -90 to 90")
-        require(
-            self,
-            "num_episodes",
-            self.num_episodes % self.batch_size == 0,
-            f"a multiple of batch_size ({self.batch_size})",
-        )

@@ -42,6 +42,8 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
       - `final_cosine` f32.
       - `rotation_error` f32 rad, geodesic; `frobenius_angle` f32 rad, formula 3.2 of the thesis.
       - `translation_error` f32 m.
+      - `surface_distance` f32 m: largest distance between a point of the object in the frames of the final camera and
+        of the target camera (MSSD of the BOP benchmark).
       - `is_false_positive` bool: a success whose rotation error is above `FALSE_POSITIVE_DEG`.
       - `unreachable` i32: images that the arm could not take.
       - `best_scores` f32[..., G]: best score after each of G generations (images that a searcher asks for at once).
@@ -51,7 +53,7 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
       - `final_qpos` and `target_qpos` f32[..., nq] rad or m: joints at the view that the search ends with, which is the
         best one of a black-box search; and joints from which the target image was taken.
       - `num_wide` i32 of `random_search`: how often a wide sample became the best view.
-      - `num_restarts` i32 of `cma_es_restarts`.
+      - `num_restarts` and `scan_images` i32 of `cma_es_restarts`: restarts, and images taken by scans.
       - `unreachable_by_generation` i32[..., G] of both forms of CMA-ES: samples that the arm could not reach.
       - `steps_lower_bound` i32 of the policies, see `steps_lower_bound`.
       - `num_helped` i32 of `sac_assisted`: steps that the local search chose.

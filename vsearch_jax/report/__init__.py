@@ -2,7 +2,8 @@
 
 from vsearch_jax.report.figures import draw_mount_heights, draw_reachability, draw_search_strip
 from vsearch_jax.report.page import draw_figures, to_png, write_files, write_report
-from vsearch_jax.report.summary import false_positive_warning, summarize_results, versions
+from vsearch_jax.report.provenance import provenance
+from vsearch_jax.report.summary import false_positive_warning, summarize_results
 from vsearch_jax.report.table import print_table
 
 __all__ = [
@@ -12,9 +13,9 @@ __all__ = [
     "draw_search_strip",
     "false_positive_warning",
     "print_table",
+    "provenance",
     "summarize_results",
     "to_png",
-    "versions",
     "write_files",
     "write_report",
 ]

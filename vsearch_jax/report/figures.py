@@ -27,7 +27,7 @@ _ENCODER_PANELS = {
 }
 _POLICY_PANELS = {
     "reward": "reward of a step",
-    "success_rate": "success rate of ended episodes",
+    "pose_success_rate": "pose success of ended episodes",
     "critic_loss": "critic loss",
     "actor_loss": "actor loss",
     "alpha": "temperature α",
@@ -165,7 +165,7 @@ def draw_search_progress(name: str, trials: Trials, num_samples: int, threshold:
 
 @styled
 def draw_policy_episodes(trials: Trials) -> Figure:
-    """Draws the evaluation of the policies: number of steps against the lower bound, and the errors of the final poses.
+    """Draws the evaluation of the policies: number of steps beside its lower bound, and the errors of the final poses.
 
     Args:
       trials: measures of `sac` from `evaluate`, arrays of [policy seeds, episodes].
@@ -176,10 +176,10 @@ def draw_policy_episodes(trials: Trials) -> Figure:
     numbers = np.arange(1, max(steps.max(), bound.max()) + 1)
     share = [100.0 * np.bincount(x, minlength=numbers[-1] + 1)[1:] / x.size for x in (steps, bound)]
     counts.bar(numbers - 0.2, share[0], 0.4, color=COLORS["sac"], label=f"ours, mean {steps.mean():.2f}")
-    counts.bar(numbers + 0.2, share[1], 0.4, color="#b9d8cd", label=f"lower bound, mean {bound.mean():.2f}")
+    counts.bar(numbers + 0.2, share[1], 0.4, color="#b9d8cd", label=f"lower bound (estimate), mean {bound.mean():.2f}")
     thesis_mean = _thesis_mean("evaluations_mean")
     counts.axvline(thesis_mean, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis_mean:g}")
-    figure.suptitle(f"{steps.size:,} episodes, random views and targets", x=0.01, ha="left")
+    figure.suptitle(f"{steps.size:,} episodes", x=0.01, ha="left")
     counts.set(xlabel="steps of an episode", ylabel="episodes (%)")
     counts.xaxis.get_major_locator().set_params(integer=True)
     _legend_above(counts)

@@ -18,6 +18,7 @@ from vsearch_jax.report.summary import Results, false_positive_warning, summariz
 from vsearch_jax.report.table import FOOTNOTE, describe_motion, table_rows
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.loop import Evaluated
+from vsearch_jax.scene import build_scene, describe_symmetry
 from vsearch_jax.search import BLACK_BOX, LABELS
 
 CAPTIONS = {
@@ -47,7 +48,8 @@ def write_report(folder: Path, evaluated: Evaluated, config: Config) -> Results:
     Raises:
       OSError: the disk is full or not writable.
     """
-    results = summarize_results(evaluated.arrays, config, evaluated.wall_seconds) | {"seed": evaluated.seed}
+    results = summarize_results(evaluated.arrays, config, evaluated.wall_seconds)
+    results |= {"seed": evaluated.seed, "symmetry": build_scene(config.scene).symmetry}
     write_files(folder, results, draw_figures(results, evaluated, config), config)
     return results
 
@@ -126,6 +128,7 @@ def _render_page(title: str, results: Results, images: Mapping[str, bytes], conf
         warning=false_positive_warning(results),
         rows=table_rows(results),
         footnote=FOOTNOTE,
+        symmetry=describe_symmetry(results["symmetry"]),
         motion=describe_motion(results),
         seeds=results["sac"]["seeds"],
         pictures=pictures,

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
-import jax
 import numpy as np
 
 from vsearch_jax.config import Config
 from vsearch_jax.evaluation import FALSE_POSITIVE_DEG, Outcome
+from vsearch_jax.report.provenance import provenance
 from vsearch_jax.report.statistics import mean_interval, rate_interval
 from vsearch_jax.report.thesis import THESIS
 from vsearch_jax.search import BLACK_BOX, LABELS, POLICIES
@@ -28,11 +26,9 @@ POSE_SUCCESS_DEG = (FALSE_POSITIVE_DEG, 5.0)
 MAX_FALSE_POSITIVE_RATE = 0.01
 """Above this rate the report warns."""
 
-_PACKAGES = ("vsearch_jax", "jax", "jaxlib", "flax", "optax", "brax", "evosax", "mujoco", "mujoco-mjx", "numpy")
-
 
 def summarize_results(arrays: Mapping[str, Outcome], config: Config, wall_seconds: Mapping[str, float]) -> Results:
-    """Computes the content of `results.json`: rates and means of the measures of each searcher, versions, machine.
+    """Computes the content of `results.json`: rates and means of each searcher's measures, config, versions, machine.
 
     Rates and means have 95 % intervals; their keys end in `_ci95`. The intervals count the trials of one initial view,
     and the episodes of one policy, as related; see `statistics`. The interval of a mean is None for a single trial. A
@@ -54,20 +50,10 @@ def summarize_results(arrays: Mapping[str, Outcome], config: Config, wall_second
         "reachable": config.env.reachable,
         "motion": config.env.motion,
         "thesis": THESIS,
-        "versions": versions(),
-        "machine": {
-            "platform": platform.platform(),
-            "python": platform.python_version(),
-            "device": jax.devices()[0].device_kind,
-            "num_devices": jax.device_count(),
-        },
+        "config": config.to_dict(),
         "wall_seconds": dict(wall_seconds),
+        **provenance(),
     }
-
-
-def versions() -> dict[str, str]:
-    """Returns the versions of the packages on which results depend, by name."""
-    return {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
 def _summarize_policies(trials: Trials, config: Config) -> Results:
@@ -98,10 +84,13 @@ def false_positive_warning(results: Results) -> str | None:
     bad = [f"{label} {100 * rate:.1f} %" for label, rate in rates.items() if rate > MAX_FALSE_POSITIVE_RATE]
     if not bad:
         return None
+    encoder = results["config"]["encoder"]
+    more = f"--encoder.num-updates above {encoder['num_updates']}"
     return (
         f"Wrong views were found: more than {FALSE_POSITIVE_DEG:g}° from the target although the cosine meets the "
         f"threshold ({', '.join(bad)} of the searches). The encoder does not tell these views apart. Train with "
-        "--encoder.loss pose and more --encoder.num-updates. If the object is symmetric, declare its symmetry."
+        f"{more if encoder['loss'] == 'pose' else '--encoder.loss pose'}. If the object looks the same after a turn "
+        "about the vertical, declare it with --scene.symmetry N (N equal turns; 0: any turn)."
     )
 
 
@@ -134,6 +123,7 @@ def summarize_trials(trials: Trials) -> Results:
         "rotation_error_deg_median": float(np.median(rotation)),
         **_mean("frobenius_angle_deg_mean", np.rad2deg(trials["frobenius_angle"])),
         **_mean("translation_error_cm_mean", 100.0 * trials["translation_error"]),
+        **_mean("mssd_cm_mean", 100.0 * trials["surface_distance"]),
         **_rate("false_positive_rate", trials["is_false_positive"]),
         **_mean("joint_travel_rad_mean", trials["joint_travel"]),
         **_mean("motion_time_s_mean", trials["motion_time"]),
@@ -144,6 +134,7 @@ def summarize_trials(trials: Trials) -> Results:
         summary |= _rate("wide_rate", trials["num_wide"] > 0)
     if "num_restarts" in trials:
         summary |= _mean("restarts_mean", trials["num_restarts"])
+        summary |= _mean("scan_images_mean", trials["scan_images"])
     if "steps_lower_bound" in trials:
         bound = trials["steps_lower_bound"]
         summary |= _mean("steps_lower_bound_mean", bound)

@@ -24,6 +24,7 @@ from vsearch_jax.scene.files import (
     xml_folder,
 )
 from vsearch_jax.scene.joint_chain import joints_above
+from vsearch_jax.scene.surface import surface_points
 
 ARM_PREFIX = "arm/"
 OBJECT_PREFIX = "object/"
@@ -53,6 +54,7 @@ class Scene:
       obstacle_geom_ids: geoms of the obstacles.
       table_geom_id: the plane of the table.
       symmetry: number of turns about the vertical that map the object to itself; 1 for none, 0 for any turn.
+      object_points: f64[P, 3] m in world, corners of the convex hull of the object.
     """
 
     mj_model: mujoco.MjModel
@@ -71,6 +73,7 @@ class Scene:
     obstacle_geom_ids: tuple[int, ...]
     table_geom_id: int
     symmetry: int
+    object_points: np.ndarray
 
 
 def build_scene(config: SceneConfig) -> Scene:
@@ -103,6 +106,7 @@ def build_scene(config: SceneConfig) -> Scene:
     _check_camera(model, camera_id, arm_path)
     joint_ids = _camera_joints(model, camera_id, arm_path)
     mount_id = model.body("mount").id
+    object_geom_ids = _geoms_below(model, model.body("object").id)
     return Scene(
         mj_model=model,
         mjx_model=_put_model(model),
@@ -116,10 +120,11 @@ def build_scene(config: SceneConfig) -> Scene:
         camera_id=camera_id,
         arm_geom_ids=tuple(g for g in _geoms_below(model, mount_id) if model.geom_bodyid[g] != mount_id),
         mount_geom_ids=tuple(np.flatnonzero(model.geom_bodyid == mount_id).tolist()),
-        object_geom_ids=_geoms_below(model, model.body("object").id),
+        object_geom_ids=object_geom_ids,
         obstacle_geom_ids=_geoms_below(model, model.body("obstacles").id),
         table_geom_id=model.geom("table").id,
         symmetry=symmetry,
+        object_points=surface_points(model, object_geom_ids),
     )
 
 

@@ -47,6 +47,7 @@ class _State:
       stalled: i32[], number of generations since `run_fitness` improved.
       ends: View of f32[R] rad, where the runs so far ended.
       num_restarts: i32[].
+      scan_images: i32[], number of images taken by scans.
     """
 
     base: CMAESState
@@ -57,6 +58,7 @@ class _State:
     stalled: Array
     ends: View
     num_restarts: Array
+    scan_images: Array
 
 
 def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: CMAESConfig) -> SearchResult:
@@ -92,6 +94,7 @@ def method(config: CMAESConfig) -> Method[_State]:
         num_views=config.population,
         counts=lambda state: {
             "num_restarts": state.num_restarts,
+            "scan_images": state.scan_images,
             "unreachable_by_generation": state.base.unreachable,
         },
     )
@@ -109,6 +112,7 @@ def _init_state(algorithm: Algorithm, config: CMAESConfig, args: SearchArgs[obje
         stalled=jnp.int32(0),
         ends=View(jnp.zeros(max_runs), jnp.zeros(max_runs)),
         num_restarts=jnp.int32(0),
+        scan_images=jnp.int32(0),
     )
 
 
@@ -154,6 +158,7 @@ def _after_scan(algorithm: Algorithm, state: _State, base: CMAESState, views: Vi
         scans_left=scans_left,
         scan_fitness=jnp.minimum(state.scan_fitness, fitness[best]),
         scan_point=point,
+        scan_images=state.scan_images + base.record.evaluations - state.base.record.evaluations,
     )
 
 

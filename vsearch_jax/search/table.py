@@ -22,7 +22,7 @@ POLICIES: dict[str, bool] = {"sac": False, "sac_assisted": True}
 LABELS = {
     "random_search": "Random search",
     "cma_es": "CMA-ES",
-    "cma_es_restarts": "CMA-ES with restarts",
+    "cma_es_restarts": "CMA-ES with scans and restarts",
     "sac": "SAC policy alone",
     "sac_assisted": "SAC with local search",
 }

@@ -12,4 +12,4 @@ Metrics: TypeAlias = dict[str, Array]
 ENCODER_STAGE, POLICY_STAGE = 0, 1
 ENCODER_METRICS = ("encoder_loss", "false_match_rate", "threshold_angle_deg")
 UPDATE_METRICS = ("critic_loss", "value_loss", "actor_loss", "alpha", "entropy")
-POLICY_METRICS = ("reward", "similarity", "success_rate", "unreachable_rate", *UPDATE_METRICS)
+POLICY_METRICS = ("reward", "similarity", "success_rate", "pose_success_rate", "unreachable_rate", *UPDATE_METRICS)

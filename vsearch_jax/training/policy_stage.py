@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 from brax.envs.base import State
 from jax import Array
 
-from vsearch_jax.env import ViewSearchEnv, obs_of
+from vsearch_jax.env import FALSE_POSITIVE_DEG, ViewSearchEnv, episode_of, obs_of, pose_error
 from vsearch_jax.search import sac
 from vsearch_jax.training.metrics import POLICY_METRICS, POLICY_STAGE, UPDATE_METRICS, Metrics
 from vsearch_jax.types import Observation, ReplayState, SACState, Transition
@@ -75,16 +76,20 @@ def _policy_iteration_of_seed(
     no_update = {name: jnp.full((), jnp.nan) for name in UPDATE_METRICS}
     one_update = functools.partial(_policy_update, key=update_key, replay=replay, env=env, pool=pool)
     sac_state, update_metrics = jax.lax.fori_loop(0, num_updates, one_update, (sac_state, no_update))
-    return PolicyCarry(sac_state, states, replay), _step_metrics(ends) | update_metrics
+    return PolicyCarry(sac_state, states, replay), _step_metrics(env, ends) | update_metrics
 
 
-def _step_metrics(ends: State) -> Metrics:
+def _step_metrics(env: ViewSearchEnv, ends: State) -> Metrics:
     """Returns metrics f32[] over the environments (leading axis) after a step."""
     terminated, truncated = ends.info["terminated"], ends.info["truncated"]
+    episode = episode_of(ends)
+    rotation, _, _ = pose_error(episode.observation.camera, episode.target.camera, env.scene.symmetry, env.center)
+    is_right = rotation <= math.radians(FALSE_POSITIVE_DEG)
     return {
         "reward": ends.reward.mean(),
         "similarity": ends.metrics["similarity"].mean(),
         "success_rate": terminated.sum() / (terminated + truncated).sum(),  # NaN if no episode ended
+        "pose_success_rate": (terminated * is_right).sum() / (terminated + truncated).sum(),
         "unreachable_rate": ends.metrics["unreachable"].mean(),
     }
 

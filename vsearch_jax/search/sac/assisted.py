@@ -22,8 +22,6 @@ from vsearch_jax.xla.tree import tree_where
 _MIN_IMPROVEMENT = 3e-3
 # A view with at least this score is near the target: about 10 degrees away at most.
 _NEAR_SCORE = 0.9
-# Approximate distance from the target at which a view meets the threshold, in rad.
-_FOUND_RADIUS = math.radians(3.0)
 
 
 @flax.struct.dataclass
@@ -67,7 +65,8 @@ def search(
       key: PRNG key of the local search.
       step_fn: the environment's `step`.
       args: the search problem. `task` holds the policy and the brax State at the start; `initial` is the view there.
-      config: the run's config. Only `sac`, `env` and `evaluation.patience` are used.
+      config: the run's config. Only `sac`, `env`, `evaluation.patience` and
+        `encoder.threshold_angle_deg` are used.
       is_assisted: bool[]; if false, the policy is alone, and the result is that of `policy.search`.
 
     Returns:
@@ -106,7 +105,7 @@ def choose_action(
 
     # The keys are equal in every step, so that the first angle and the sweep's direction stay.
     around_key, sweep_key = jax.random.split(key)
-    around = _view_around_best(around_key, record, num_around, args)
+    around = _view_around_best(around_key, record, num_around, args, config)
     sweep = _sweep_view(sweep_key, num_steps, state, args.band, config)
     towards = _action_towards(tree_where(is_near, around, sweep), state, config)
     action = jnp.where(is_helped, towards, mean_action(args.task.actor, state, config))
@@ -116,15 +115,18 @@ def choose_action(
     )
 
 
-def _view_around_best(key: Array, record: Record, num_around: Array, args: SearchArgs[PolicyTask]) -> View:
+def _view_around_best(
+    key: Array, record: Record, num_around: Array, args: SearchArgs[PolicyTask], config: Config
+) -> View:
     """Returns the view around the best view that follows `num_around` (i32[]) others.
 
     The first four views lie on a circle, 90 degrees apart. Its radius is the estimated distance of the target. Each
-    further circle is wider by this radius and turned by 45 degrees.
+    further circle is wider by this radius and turned by 45 degrees. The estimate takes the angle at which the pose loss
+    wants the threshold. The codes of an autoencoder are less sharp, so its circles are too small.
     """
     missing = jnp.maximum(1.0 - record.score, 0.0) / (1.0 - args.threshold)
     quarters, circles = num_around.astype(jnp.float32), (num_around // 4).astype(jnp.float32)
-    radius = _FOUND_RADIUS * jnp.sqrt(missing) * (1.0 + circles)
+    radius = math.radians(config.encoder.threshold_angle_deg) * jnp.sqrt(missing) * (1.0 + circles)
     angle = 2.0 * jnp.pi * jax.random.uniform(key) + 0.5 * jnp.pi * quarters + 0.25 * jnp.pi * circles
     return View(
         azimuth=wrap_angle(record.view.azimuth + radius * jnp.cos(angle)),
