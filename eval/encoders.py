@@ -33,16 +33,12 @@ from parts import PARTS, write_part
 from vsearch_jax import report, runs
 from vsearch_jax.types import EncoderState, ReachabilityMap
 
-UPDATES = {"pose": 500, "autoencoder": 540, "both": 260}
-"""Updates of each loss. They shall take about equal time; each row holds its seconds."""
-THESIS = {
-    "optimizer": "adam",
-    "intensity": "linear",
-    "learning_rate": 1e-3,
-    "channels": (64, 128, 128),
-    "hidden_sizes": (),
+LOSSES = {
+    "pose": vs.Config.preset("cpu").encoder,
+    "autoencoder": vs.Config.preset("autoencoder").encoder,
+    "both": dataclasses.replace(vs.Config.preset("cpu").encoder, loss="both", num_updates=260),
 }
-"""Fields of the encoder's config for the autoencoder: trained as the thesis does, at our higher step size."""
+"""Encoder's config by the name of the row. The numbers of updates take about equal time; each row holds its seconds."""
 OBJECTS = ("teapot", "truck", "bracket", "part:plate", "part:bracket", "part:gear")
 SHOWN = {
     "false_match_rate": ("matches > 10° off (%)", 100.0),
@@ -51,6 +47,7 @@ SHOWN = {
     "threshold_angle_deg_azimuth": ("angle at the threshold: azimuth (°)", 1.0),
     "threshold_angle_deg_elevation": ("elevation (°)", 1.0),
     "basin_share": ("basin (%)", 100.0),
+    "basin_share_far": ("basin from ≥ 150° (%)", 100.0),
     "far_cosine_max_mean": ("best cosine > 20° off", 1.0),
     "arm_cosine_change_percent": ("arm: cosine (%)", 1.0),
     "arm_pose_change_deg": ("arm: pose (°)", 1.0),
@@ -70,7 +67,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument(
         "--objects", nargs="+", default=OBJECTS, help="names or files; part:NAME is one of eval/parts.py"
     )
-    parser.add_argument("--losses", nargs="+", default=tuple(UPDATES), choices=tuple(UPDATES))
+    parser.add_argument("--losses", nargs="+", default=tuple(LOSSES), choices=tuple(LOSSES))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--runs", nargs="+", type=Path, default=(), help="measure the encoders of these runs instead")
     parser.add_argument("--quick", action="store_true", help="small sizes, for a test")
@@ -78,7 +75,7 @@ def main(arguments: list[str]) -> None:
     rows = options.out / "rows"
     rows.mkdir(parents=True, exist_ok=True)
     for run in options.runs:
-        _measure_run(run, rows / f"{run.name}.json", options.quick)
+        _measure_run(run, rows / f"{'-'.join(run.resolve().parts[-2:])}.json", options.quick)
     for name in () if options.runs else options.objects:
         for loss in options.losses:
             for seed in range(options.seeds):
@@ -107,7 +104,7 @@ def _measure_run(run: Path, path: Path, is_quick: bool) -> None:
         raise SystemExit(f"--runs {run}: its encoder is not trained yet; first: vsearch train --out {run} --resume")
     lines = runs.read_metrics(run)
     seconds = sum(line["seconds"] for line in lines if line["stage"] == "encoder")
-    row = {"object": Path(config.scene.object).stem, "loss": config.encoder.loss, "seed": runs.read_seed(run)}
+    row = {"object": Path(config.scene.object).name, "loss": config.encoder.loss, "seed": runs.read_seed(run)}
     row |= _measure(state.encoder, state.reach, config, runs.read_seed(run), is_quick)
     row |= {"train_seconds": seconds, "num_updates": config.encoder.num_updates}
     runs.write_atomically(path, json.dumps(row, indent=1) + "\n")
@@ -125,10 +122,7 @@ def _config(name: str, loss: str, out: Path, is_quick: bool) -> vs.Config:
             )
         path = write_part(part, out / "parts")
         scene = dataclasses.replace(config.scene, object=str(path), mesh_scale=0.001)
-    updates = config.encoder.num_updates if is_quick else UPDATES[loss]
-    encoder = dataclasses.replace(config.encoder, loss=loss, num_updates=updates)
-    if loss == "autoencoder":
-        encoder = dataclasses.replace(encoder, **THESIS)
+    encoder = dataclasses.replace(config.encoder, loss=loss) if is_quick else LOSSES[loss]
     return dataclasses.replace(config, scene=scene, encoder=encoder)
 
 
@@ -174,6 +168,13 @@ def to_markdown(content: Mapping[str, Any]) -> str:
       content: what `encoders.json` holds.
     """
     lines = ["# Losses of the encoder", "", f"Written by `{content['command']}`. Means over the seeds.", ""]
+    lines += ["Each loss has the network and the optimizer that suit it. They differ from the preset `cpu` in:", ""]
+    usual = LOSSES["pose"]
+    for name, encoder in LOSSES.items():
+        differing = [f for f in dataclasses.fields(encoder) if getattr(encoder, f.name) != getattr(usual, f.name)]
+        text = ", ".join(f"{f.name} {getattr(encoder, f.name)}" for f in differing)
+        lines.append(f"- `{name}`: {text or 'nothing'}.")
+    lines.append("")
     lines += [f"| object | loss | seeds | {' | '.join(label for label, _ in SHOWN.values())} |"]
     lines += ["|---" * (len(SHOWN) + 3) + "|"]
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}

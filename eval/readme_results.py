@@ -1,25 +1,30 @@
 """Writes the results of README.md from the files in docs/results: `python eval/readme_results.py [NAME=FOLDER ...]`.
 
-Each FOLDER is that of a run or of an evaluation. Its results.json is copied to docs/results/NAME.json first. `teapot`
-is the run of the large table, `teapot-dynamic` its evaluation with dynamics. All other names are rows of the table of
-other runs, in the order of the names. `moves.json` is written by eval/moves.py. Commit README.md and the files.
+Each FOLDER is that of a run or of an evaluation. Its results.json is copied to docs/results/NAME.json first. Paths
+in it are reduced to file names. `teapot` is the run of the large table, `teapot-dynamic` its evaluation with dynamics.
+All other names are rows of the table of other runs, in the order of the names. `moves.json` is written by
+eval/moves.py. Commit README.md and the files.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jinja2
+
+import vsearch_jax as vs
 from vsearch_jax.report.summary import Results, false_positive_warning
 from vsearch_jax.report.table import table_rows
+from vsearch_jax.runs import write_atomically
 from vsearch_jax.search import LABELS
 
 ROOT = Path(__file__).resolve().parents[1]
+TEMPLATE = "readme_protocol.md.jinja"
 README, FOLDER = ROOT / "README.md", ROOT / "docs" / "results"
 MAIN, DYNAMIC, MOVES = "teapot", "teapot-dynamic", "moves"
 """Names of the files with a section of their own."""
@@ -32,6 +37,10 @@ def results_section(results: Results) -> str:
       results: content of a run's results.json.
     """
     lines = [
+        f"One run of `vsearch train {_options(results)}`. Brackets are 95 % intervals. They count trials that start at",
+        "one initial view, and episodes of one policy, as related. With one policy its interval is that of its",
+        "episodes, and says nothing about another training.",
+        "",
         "| | " + " | ".join(LABELS.values()) + " | thesis: random / CMA-ES / SAC |",
         "|---" * (len(LABELS) + 2) + "|",
     ]
@@ -51,7 +60,26 @@ def results_section(results: Results) -> str:
     stages = ", ".join(f"{stage} {value:.0f} s" for stage, value in seconds.items())
     lines.append(f"- **Wall time**: {stages}, on {results['machine']['device']}, seed {results['seed']}.")
     warning = false_positive_warning(results)
-    return "\n".join([*lines, *([f"- {warning}"] if warning else [])]) + "\n"
+    return "\n".join([*lines, *([f"- {warning}"] if warning else []), _protocol(results)]) + "\n"
+
+
+def _options(results: Results) -> str:
+    """Returns the options of `vsearch train` that differ from the preset `cpu`, and the seed."""
+    config, usual = results["config"], json.loads(json.dumps(vs.Config.preset("cpu").to_dict()))
+    options = [f"--object {config['scene']['object']}"]
+    for section, values in config.items():
+        for field, value in values.items() if isinstance(values, dict) else ():
+            if value != usual[section][field] and field != "object":
+                options.append(f"--{section}.{field}".replace("_", "-") + f" {value}")
+    return " ".join([*options, f"--seed {results['seed']}"])
+
+
+def _protocol(results: Results) -> str:
+    """Returns sentences on how the numbers came about, with the run's own settings."""
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    template = jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined).get_template(TEMPLATE)
+    config = results["config"]
+    return template.render(results=results, config=config, evaluation=config["evaluation"])
 
 
 def other_runs_section(runs: dict[str, Results]) -> str:
@@ -63,13 +91,18 @@ def other_runs_section(runs: dict[str, Results]) -> str:
     columns: dict[str, Callable[[Results], str]] = {
         "pose success, error ≤ 10° (%)": lambda row: f"{100 * row['pose_success_rate']:.1f}",
         "images or steps, mean": lambda row: f"{row['evaluations_mean']:.1f}",
-        "rotational error, median (°)": lambda row: f"{row['rotation_error_deg_median']:.1f}",
+        "rotational error, mean (°)": lambda row: f"{row['rotation_error_deg_mean']:.1f}",
+        "median (°)": lambda row: f"{row['rotation_error_deg_median']:.1f}",
+        "translational error, mean (cm)": lambda row: f"{row['translation_error_cm_mean']:.1f}",
         "false positives (%)": lambda row: f"{100 * row['false_positive_rate']:.1f}",
     }
-    lines = ["| run | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    header = ["run", "options", *columns, "policy alone: episodes", "steps / lower bound (estimate)"]
+    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
     for name, results in runs.items():
         cells = [" / ".join(number(results[searcher]) for searcher in LABELS) for number in columns.values()]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        policy = results["sac"]
+        cells += [f"{policy['episodes']:,}", f"{policy['evaluations_over_lower_bound']:.3f}"]
+        lines.append(f"| {name} | `{_options(results)}` | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -139,7 +172,10 @@ def main(arguments: list[str]) -> None:
         if not name or not folder:
             parser.error(f"{item!r} is not of the form NAME=FOLDER")
         FOLDER.mkdir(exist_ok=True)
-        shutil.copyfile(Path(folder) / "results.json", FOLDER / f"{name}.json")
+        results = json.loads((Path(folder) / "results.json").read_text(encoding="utf-8"))
+        scene = results["config"]["scene"]
+        scene |= {part: Path(scene[part]).name for part in ("arm", "object", "obstacles") if scene[part]}
+        write_atomically(FOLDER / f"{name}.json", json.dumps(results, indent=2) + "\n")
     README.write_text(with_sections(README.read_text(encoding="utf-8"), sections()), encoding="utf-8")
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import hashlib
 import json
 import os
 import shlex
@@ -20,6 +21,7 @@ from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before jax is imported
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -48,6 +50,7 @@ def main(arguments: list[str]) -> None:
         parser.error(f"--run {options.run}: holds no run; name the folder of a run, or leave the option out")
     run = options.run or options.out / "run"
     state, config = _trained_run(run, options.preset, options.seed, options.quick)
+    _check_same_encoder(options.out, run, state, config, options.quick)
     band = np.rad2deg(np.asarray(state.reach.band))
     num_runs = 2 if options.quick else 10
     searches = {
@@ -68,6 +71,7 @@ def main(arguments: list[str]) -> None:
         "encoder": f"loss {config.encoder.loss}, {config.encoder.num_updates} updates, object {config.scene.object}",
         "table_5_1": tables.table_5_1(searches["k_sweep"]),
         "searchers": tables.searcher_rows(searches["repeats"] | {"sac": policies}),
+        "wide_sweep": tables.wide_sweep(searches["wide_sweep"]),
         "table_5_2": tables.table_5_2(searches["penalty"]),
         "config": config.to_dict(),
         "thesis_policy_config": thesis_config.to_dict(),
@@ -89,6 +93,16 @@ def _trained_run(run: Path, preset: str, seed: int, is_quick: bool) -> tuple[Tra
         config = runs.read_config(run)
         state = runs.resume_run(run, config)
     return runs.train_to_end(run, state, config), config
+
+
+def _check_same_encoder(out: Path, run: Path, state: TrainState, config: vs.Config, is_quick: bool) -> None:
+    """Notes in DIR which encoder its results are of. Ends the command if DIR holds results of another one."""
+    leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(state.encoder))
+    mine = {"encoder_sha256": hashlib.sha256(leaves).hexdigest(), "config": config.to_dict(), "is_quick": is_quick}
+    text, path = json.dumps(mine, indent=1) + "\n", out / "encoder.json"
+    if path.is_file() and path.read_text(encoding="utf-8") != text:
+        raise SystemExit(f"--out {out} holds results of another encoder than that of {run}; name another folder")
+    runs.write_atomically(path, text)
 
 
 def _kept(out: Path, name: str, compute: Callable[[], Arrays]) -> Arrays:

@@ -21,7 +21,7 @@ from vsearch_jax.xla.batching import map_in_batches
 from vsearch_jax.xla.tree import tree_where
 
 DISTURBANCES = ("none", "arm", "light", "occlusion", "shift", "noise", "blur")
-"""`none` and `arm` have random arm configurations; the others have one configuration for each view."""
+"""`arm` has random arm configurations; the others, `none` included, have one configuration for each view."""
 _BATCH = 64
 _OCCLUDED_SIDE, _NOISE_STD, _BLUR_STD = 0.3, 0.05, 1.5
 """Side of the occluding square as a part of the image; noise of a channel in [0, 1]; blur in pixels."""

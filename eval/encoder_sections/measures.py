@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from encoder_sections.images import Codes
+from vsearch_jax.env import FALSE_POSITIVE_DEG
 
-_LIMIT_DEG = 10.0
-"""A match whose angle is larger is wrong."""
+_FAR_DEG = 150.0
+"""From here on a start is on the far side of the target, in degrees of azimuth."""
 
 
 def measure(codes: Codes, band_deg: float, symmetry: int, threshold: float) -> dict[str, float]:
@@ -29,7 +30,7 @@ def measure(codes: Codes, band_deg: float, symmetry: int, threshold: float) -> d
     rotations = np.asarray(codes.grid_camera.rotation).reshape(-1, 3, 3)
     cosines, angles = grid @ grid.T, _angles_deg(rotations, rotations, symmetry)
     np.fill_diagonal(cosines, -1.0)
-    is_match, is_far = cosines >= threshold, angles > _LIMIT_DEG
+    is_match, is_far = cosines >= threshold, angles > FALSE_POSITIVE_DEG
     azimuth, elevation = (_axis_angle(cosines.reshape(*shape, *shape), axis, angles, threshold) for axis in (0, 1))
     rings = {f"cosine_at_{degrees}_deg": _ring(cosines, angles, degrees) for degrees in (3, 5, 10, 90)}
     return {
@@ -39,7 +40,7 @@ def measure(codes: Codes, band_deg: float, symmetry: int, threshold: float) -> d
         "threshold_angle_deg_azimuth": azimuth,
         "threshold_angle_deg_elevation": elevation,
         "far_cosine_max_mean": float(np.where(angles > 20.0, cosines, -1.0).max(axis=1).mean()),
-        "basin_share": _basin(cosines, shape),
+        **_basin(cosines, angles, shape),
         **rings,
         **_robustness(codes, band_deg, symmetry),
     }
@@ -88,10 +89,12 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if values.size else math.nan
 
 
-def _basin(cosines: np.ndarray, shape: tuple[int, int]) -> float:
+def _basin(cosines: np.ndarray, angles: np.ndarray, shape: tuple[int, int]) -> dict[str, float]:
     """Returns the share of the pairs (start, target) from which climbing the cosine over the grid leads to the target.
 
-    A step goes to the best of the eight neighbours. The target is reached at a distance of one neighbour.
+    A step goes to the best of the eight neighbours. The target is reached at a distance of one neighbour, or at a
+    distance of as many degrees from a pose from which the object looks the same. `basin_share_far` is of the starts
+    whose azimuth is 150 degrees or more from the target's.
     """
     numbers = np.arange(cosines.shape[0]).reshape(shape)
     rows, columns = np.indices(shape)
@@ -109,14 +112,18 @@ def _basin(cosines: np.ndarray, shape: tuple[int, int]) -> float:
         position = np.take_along_axis(best, position, axis=0)
     np.fill_diagonal(cosines, -1.0)
     targets = np.arange(cosines.shape[0])
-    return float((neighbours[:, targets][None] == position[:, None]).any(axis=1).mean())
+    is_found = (neighbours[:, targets][None] == position[:, None]).any(axis=1)
+    is_found |= angles[position, targets[None]] <= 360.0 / shape[0]
+    azimuths = np.repeat(np.arange(shape[0]), shape[1]) * 360.0 / shape[0]
+    apart = np.abs((azimuths[:, None] - azimuths[None] + 180.0) % 360.0 - 180.0)
+    return {"basin_share": float(is_found.mean()), "basin_share_far": _mean(is_found[apart >= _FAR_DEG])}
 
 
 def _robustness(codes: Codes, band_deg: float, symmetry: int) -> dict[str, float]:
     """Returns for each disturbance how much it changes the cosine, and how far it moves the best match."""
     measured: dict[str, float] = {}
     grid = _unit(np.asarray(codes.grid))
-    clean = _unit(np.asarray(codes.disturbed["none"])[:, 0])
+    clean = _unit(np.asarray(codes.disturbed["none"])[:, 0])  # its images are equal
     period = 360.0 / symmetry if symmetry > 0 else 1e-6
     for name, disturbed in codes.disturbed.items():
         if name == "none":

@@ -8,18 +8,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from thesis_sections.published import CONVERGED_RANGES, FAILED_RUNS, POLICY_MEANS, TABLE_5_1, TABLE_5_2
+from thesis_sections.published import FAILED_RUNS, TABLE_5_1, TABLE_5_2
 from vsearch_jax.report.style import COLORS, INK, THESIS_COLOR, styled
+from vsearch_jax.report.thesis import thesis_range
 from vsearch_jax.search import LABELS
 
 Arrays = Mapping[str, np.ndarray]
 """Measures of a searcher by name, arrays of [initial views, runs]."""
 
 _MEASURES = (
-    ("final_cosine", "final cosine", 1.0),
-    ("rotation_error", "rotational error (°)", 180.0 / np.pi),
-    ("translation_error", "translational error (cm)", 100.0),
+    ("final_cosine", "final cosine", 1.0, "final_cosine_mean"),
+    ("rotation_error", "rotational error (°)", 180.0 / np.pi, "rotation_error_deg_mean"),
+    ("translation_error", "translational error (cm)", 100.0, "translation_error_cm_mean"),
 )
+"""Measure, label, factor to the label's unit, and key in `results.json`."""
 _K_COLORS = ("#a6c4e5", "#3b6fb6", "#d1812c", "#8c3f1f")
 _POLICY_PANELS = {
     "reward": "reward of a step",
@@ -37,7 +39,7 @@ def draw_k_sweep(outcomes: Mapping[str, Arrays], measure: int) -> Figure:
       outcomes: {"k 0.5": measures, ...}.
       measure: 0 cosine, 1 rotation, 2 translation.
     """
-    key, label, scale = _MEASURES[measure]
+    key, label, scale, _ = _MEASURES[measure]
     figure = Figure(figsize=(8, 3.6))
     views, means = figure.subplots(1, 2, width_ratios=(3, 1.4))
     for i, (name, arrays) in enumerate(outcomes.items()):
@@ -65,7 +67,7 @@ def draw_runs(name: str, arrays: Arrays, measure: int, threshold: float) -> Figu
       measure: 0 cosine, 1 rotation, 2 translation.
       threshold: cosine at which a search ends.
     """
-    key, label, scale = _MEASURES[measure]
+    key, label, scale, _ = _MEASURES[measure]
     values, failed = scale * arrays[key], ~arrays["is_success"]
     num_views, num_runs = values.shape
     figure = Figure(figsize=(8, 4.4))
@@ -98,10 +100,10 @@ def draw_comparison(outcomes: Mapping[str, Arrays]) -> Figure:
     """
     figure = Figure(figsize=(11, 3.6))
     for measure, axes in enumerate(figure.subplots(1, 3)):
-        key, label, scale = _MEASURES[measure]
-        axes.axhspan(
-            *CONVERGED_RANGES[measure], color=THESIS_COLOR, alpha=0.25, linewidth=0, label="thesis, threshold met"
-        )
+        key, label, scale, summary_key = _MEASURES[measure]
+        published = thesis_range("cma_es", summary_key)  # that of random search is equal
+        assert published is not None
+        axes.axhspan(*published, color=THESIS_COLOR, alpha=0.25, linewidth=0, label="thesis, threshold met")
         for i, (name, arrays) in enumerate(outcomes.items()):
             values = np.ma.masked_where(~arrays["is_success"], scale * arrays[key])
             x = np.arange(1, len(values) + 1) + 0.24 * (i - (len(outcomes) - 1) / 2)
@@ -176,14 +178,11 @@ def draw_policy_evaluation(arrays: Arrays) -> Figure:
     """
     figure = Figure(figsize=(12, 3.2))
     panels = figure.subplots(1, 4)
-    shown = {
-        "steps": ("evaluations", "steps of an episode", 1.0),
-        "cosine": ("final_cosine", "final cosine", 1.0),
-        "rotation": ("rotation_error", "rotational error (°)", 180.0 / np.pi),
-        "translation": ("translation_error", "translational error (cm)", 100.0),
-    }
-    for axes, (name, (key, label, scale)) in zip(panels, shown.items(), strict=True):
-        _plot_histogram(axes, scale * arrays[key].ravel(), POLICY_MEANS[name], label, is_count=name == "steps")
+    shown = (("evaluations", "steps of an episode", 1.0, "evaluations_mean"), *_MEASURES)
+    for axes, (key, label, scale, summary_key) in zip(panels, shown, strict=True):
+        published = thesis_range("sac", summary_key)
+        assert published is not None  # the thesis gives all measures that are drawn
+        _plot_histogram(axes, scale * arrays[key].ravel(), published[0], label, is_count=key == "evaluations")
     panels[0].set(ylabel="episodes (%)")
     return figure
 

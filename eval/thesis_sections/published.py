@@ -20,11 +20,3 @@ error in cm, final cosine."""
 
 FAILED_RUNS = {"random_search": (1, 2, 5, 7, 9, 10), "cma_es": (2, 3, 5, 7, 9)}
 """Runs (1 to 10) of 12 trials in which one trial did not meet the threshold (sections 5.1 and 5.2)."""
-
-CONVERGED_RANGES = ((0.985, 0.99), (4.0, 5.0), (1.0, 2.0))
-"""Figure 5.10, trials that met the threshold: ranges of final cosine, rotational error in degrees, translational error
-in cm."""
-
-POLICY_MEANS = {"steps": 4.0, "cosine": 0.99, "rotation": 3.0, "translation": 1.3}
-"""Section 5.5, 100 episodes: mean number of steps, final cosine, rotational error in degrees, translational error in
-cm."""

@@ -31,6 +31,8 @@ _METHODS = {
     "cma_es": cma_es.method,
     "cma_es_restarts": cma_es_restarts.method,
 }
+WIDE_SWEEP = (0, 1, 2, 3, 5)
+"""Numbers of samples in ten of random search that are uniform over the band."""
 _PENALTY_ELEVATION_DEG = 45.0
 """Elevation of the target of table 5.2. There, turns of 130 to 170 degrees are 45 to 49 cm, as in the thesis."""
 
@@ -52,7 +54,7 @@ class Experiment(NamedTuple):
 
 
 def experiments(config: Config, band_deg: tuple[float, float], num_runs: int) -> dict[str, Experiment]:
-    """Returns the experiments of thesis 5.1 to 5.4 by name.
+    """Returns the experiments of thesis 5.1 to 5.4 by name, and the sweep of our wide samples of random search.
 
     Args:
       config: the config of the run that gives the encoder.
@@ -70,6 +72,12 @@ def experiments(config: Config, band_deg: tuple[float, float], num_runs: int) ->
         "k_sweep": Experiment(
             {f"k {k:g}": ("random_search", RandomSearchConfig(k=k, num_wide=0)) for k in TABLE_5_1},
             six,
+            target,
+            num_runs,
+        ),
+        "wide_sweep": Experiment(
+            {f"wide {wide}": ("random_search", RandomSearchConfig(num_wide=wide)) for wide in WIDE_SWEEP},
+            twelve,
             target,
             num_runs,
         ),

@@ -69,7 +69,22 @@ def searcher_rows(outcomes: Mapping[str, Arrays]) -> list[Row]:
         if failed.any():
             row["failed_cosine_range"] = _range(arrays["final_cosine"][failed])
             row["failed_rotation_error_deg_range"] = _range(np.rad2deg(arrays["rotation_error"][failed]))
-        rows.append(row | {"pose_success_rate": ours["pose_success_rate"]})
+        rows.append(row | {key: ours[key] for key in ("pose_success_rate", "pose_success_rate_ci95")})
+    return rows
+
+
+def wide_sweep(outcomes: Mapping[str, Arrays]) -> list[Row]:
+    """Returns random search for several shares of wide samples, which the thesis does not have.
+
+    Args:
+      outcomes: {"wide 0": measures, ...}, arrays of [initial views, runs].
+    """
+    rows = []
+    for name, arrays in outcomes.items():
+        ours = summarize_trials(arrays)
+        keys = ("pose_success_rate", "evaluations_mean", "rotation_error_deg_mean")
+        row = {"num_wide": int(name.split()[1]), "trials": ours["episodes"]}
+        rows.append(row | {f"{key}{end}": ours[f"{key}{end}"] for key in keys for end in ("", "_ci95")})
     return rows
 
 
@@ -140,6 +155,7 @@ def to_markdown(content: Mapping[str, Any]) -> str:
             "",
             "trials",
             "success by cosine (%)",
+            "pose success (%)",
             "images or steps",
             "rotational error (°)",
             "translational error (cm)",
@@ -150,12 +166,27 @@ def to_markdown(content: Mapping[str, Any]) -> str:
                 row["searcher"],
                 str(row["trials"]),
                 _percent(row, "success_rate"),
+                _percent(row, "pose_success_rate"),
                 _cell(row, "evaluations_mean", 1),
                 _cell(row, "rotation_error_deg_mean", 1),
                 _cell(row, "translation_error_cm_mean", 1),
                 _failures(row),
             ]
             for row in content["searchers"]
+        ],
+    )
+    lines += ["", "## Random search: samples in ten that are uniform over the band (ours; 0 is the thesis's)", ""]
+    lines += _table(
+        ["wide samples", "trials", "pose success (%)", "images", "rotational error (°)"],
+        [
+            [
+                str(row["num_wide"]),
+                str(row["trials"]),
+                _percent(row, "pose_success_rate"),
+                _cell(row, "evaluations_mean", 1),
+                _cell(row, "rotation_error_deg_mean", 1),
+            ]
+            for row in content["wide_sweep"]
         ],
     )
     lines += ["", "## Table 5.2: CMA-ES with the penalty, and solved with bounds", ""]

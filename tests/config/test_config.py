@@ -48,7 +48,7 @@ def test_the_error_names_field_and_value_out_of_range(build, field, value):
 
 
 def test_the_error_names_the_unknown_preset_and_all_presets():
-    with pytest.raises(ConfigError, match=r"`preset` is 'big'; allowed: smoke, cpu, thesis, gpu"):
+    with pytest.raises(ConfigError, match=r"`preset` is 'big'; allowed: smoke, cpu, autoencoder, thesis, gpu"):
         Config.preset("big")
 
 

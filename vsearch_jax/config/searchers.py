@@ -34,7 +34,7 @@ class CMAESConfig:
     population: int = 10
     """Number of views in a generation."""
     sigma_deg: float = 90.0
-    """Initial standard deviation of the azimuth, in degrees. Not that of CMA-ES with restarts, which has its own."""
+    """Initial standard deviation of the azimuth, in degrees. CMA-ES with restarts has its own."""
     max_generations: int = 30
     """Number of generations after which the search gives up."""
     constraint: Literal["bounds", "penalty"] = "bounds"

@@ -68,7 +68,7 @@ class Config:
         """Returns a ready-made configuration.
 
         Args:
-          name: smoke (small, for tests), cpu, thesis or gpu.
+          name: smoke (small, for tests), cpu, autoencoder (cpu with the thesis's encoder), thesis or gpu.
 
         Raises:
           ConfigError: no preset has that name.
@@ -106,6 +106,18 @@ PRESETS: dict[str, Config] = {
         num_chunks=4,
     ),
     "cpu": Config(num_chunks=45),
+    "autoencoder": Config(  # the preset cpu with the thesis's loss and optimizer, and a network that suits them
+        encoder=EncoderConfig(
+            loss="autoencoder",
+            intensity="linear",
+            optimizer="adam",
+            channels=(64, 128, 128),
+            hidden_sizes=(),
+            num_updates=540,
+            learning_rate=1e-3,
+        ),
+        num_chunks=47,
+    ),
     "thesis": Config(
         encoder=EncoderConfig(
             loss="autoencoder",

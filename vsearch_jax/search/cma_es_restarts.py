@@ -1,4 +1,4 @@
-"""CMA-ES with restarts: each run of the strategy of `cma_es` starts at the best view of a uniform scan."""
+"""CMA-ES with scans and restarts: each run of the strategy of `cma_es` starts at the best view of a uniform scan."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def search(key: Array, score_fn: ScoreFn[Task], args: SearchArgs[Task], config: 
 
 
 def method(config: CMAESConfig) -> Method[_State]:
-    """Returns CMA-ES with restarts in parts (start, ask, tell, record), for a caller that takes the images itself."""
+    """Returns this searcher in parts (start, ask, tell, record), for a caller that takes the images itself."""
     algorithm = cma_es.build_algorithm(config)
     return Method(
         start=functools.partial(_init_state, algorithm, config),
