@@ -58,9 +58,9 @@ def _environment_steps(env: ViewSearchEnv, batch: int, settings: Settings) -> Ro
 
 
 def _sac_updates(env: ViewSearchEnv, num_policies: int, settings: Settings) -> Row:
-    config, size = env.config.sac, env.observation_size
+    config, size, code_size = env.config.sac, env.observation_size, env.config.encoder.code_size
     keys = jax.random.split(jax.random.key(0), num_policies)
-    states = jax.jit(jax.vmap(lambda key: sac.init(key, config, size, env.action_size)))(keys)
+    states = jax.jit(jax.vmap(lambda key: sac.init(key, config, size, env.action_size, code_size)))(keys)
     shape = (num_policies, config.batch_size)
     obs, scalar = jnp.zeros((*shape, size)), jnp.zeros(shape)
     batch = Transition(obs, jnp.zeros((*shape, env.action_size)), scalar, obs, scalar, scalar + 1.0)

@@ -34,6 +34,7 @@ def thesis_config(config: Config, is_quick: bool) -> Config:
         num_warmup_steps=16 if is_quick else 504,
         updates_per_step=1.0,
         initial_temperature=0.05,
+        network="plain",
         pool_fraction=0.0,
         relabel_fraction=0.0,
     )

@@ -45,7 +45,9 @@ def state(config: vs.Config) -> TrainState:
         shapes = jax.eval_shape(function, jax.random.key(0))
         return jax.tree.map(lambda x: jnp.asarray(0.2 * random.normal(size=x.shape), x.dtype), shapes)
 
-    sac_state = random_like(lambda key: sac.init(key, config.sac, 2 * config.encoder.code_size + 9))
+    sac_state = random_like(
+        lambda key: sac.init(key, config.sac, 2 * config.encoder.code_size + 9, code_size=config.encoder.code_size)
+    )
     actors = jax.tree.map(lambda x: x[None], sac_state)
     encoder = random_like(lambda key: encoders.init(key, config))
     unused: Any = None

@@ -64,8 +64,10 @@ class SACConfig:
     """Number of updates for each environment step."""
     batch_size: int = 256
     """Number of transitions in an update."""
+    network: Literal["siamese", "plain"] = "siamese"
+    """First layers of actor and critic. siamese: shared layers read both codes. plain: one layer reads all (thesis)."""
     hidden_sizes: tuple[int, ...] = (256, 256)
-    """Number of units in each hidden layer of actor and critic."""
+    """Number of units in each hidden layer of actor and critic. The shared layers have the first number twice."""
     learning_rate: float = 1e-3
     """Initial step size of Adam, for actor, critic and temperature. It falls linearly to zero over the run."""
     discount: float = 0.9
@@ -85,6 +87,7 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         require(self, "algorithm", self.algorithm in ("twin_q", "value"), "twin_q or value")
+        require(self, "network", self.network in ("siamese", "plain"), "siamese or plain")
         require_positive(
             self,
             "num_seeds",

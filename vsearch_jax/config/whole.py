@@ -134,7 +134,7 @@ PRESETS: dict[str, Config] = {
             pool_size=4096,
         ),
         random_search=RandomSearchConfig(num_wide=0),
-        sac=SACConfig(num_seeds=3, num_environment_steps=10_880),
+        sac=SACConfig(num_seeds=3, num_environment_steps=10_880, network="plain"),
         num_chunks=767,
     ),
     "gpu": Config(

@@ -36,7 +36,7 @@ _LATER_FIELDS: dict[str, dict[str, object]] = {
     "env": {"target": "random"},
     "random_search": {"num_wide": 0},
     "cma_es": {"constraint": "bounds"},
-    "sac": {"algorithm": "twin_q", "pool_fraction": 0.0, "imitation_weight": 0.0},
+    "sac": {"algorithm": "twin_q", "network": "plain", "pool_fraction": 0.0, "imitation_weight": 0.0},
 }
 """Fields of the config that came after version 0.2.0, with the values that mean what earlier versions did."""
 

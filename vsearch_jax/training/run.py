@@ -51,7 +51,11 @@ def init(key: Array, config: Config) -> TrainState:
     transition = jax.eval_shape(transition_of, start, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), start)
     seed_keys = jax.random.split(jax.random.fold_in(key, _SAC_INIT), num_seeds)
     init_sac = functools.partial(
-        sac.init, config=config.sac, observation_size=env.observation_size, action_size=env.action_size
+        sac.init,
+        config=config.sac,
+        observation_size=env.observation_size,
+        action_size=env.action_size,
+        code_size=config.encoder.code_size,
     )
     replay = sac.init_replay(tree_zeros(transition, ()), config.sac.num_environment_steps)
     return TrainState(

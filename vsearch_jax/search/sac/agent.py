@@ -41,7 +41,9 @@ class KnownActions(NamedTuple):
     is_known: Array
 
 
-def init(key: Array, config: SACConfig, observation_size: int, action_size: int = _ACTION_SIZE) -> SACState:
+def init(
+    key: Array, config: SACConfig, observation_size: int, action_size: int = _ACTION_SIZE, code_size: int = 0
+) -> SACState:
     """Creates the state of soft actor-critic before training: random networks and fresh optimizers.
 
     The target networks equal the networks.
@@ -51,17 +53,20 @@ def init(key: Array, config: SACConfig, observation_size: int, action_size: int 
       config: settings of soft actor-critic.
       observation_size: number of entries in an obs, the policy's input vector.
       action_size: number of entries in an action.
+      code_size: number of entries in a code, if the obs starts with two codes; else 0. Read with `network` "siamese".
 
     Returns:
       Parameters and optimizer states before the first update.
     """
     actor_key, critic_key = jax.random.split(key)
+    code_size = code_size if config.network == "siamese" else 0
     value = None
     if config.algorithm == "value":
-        value = init_network(jax.random.fold_in(critic_key, 2), Value, (observation_size, *config.hidden_sizes, 1))
-    actor = init_network(actor_key, Actor, (observation_size, *config.hidden_sizes, 2 * action_size))
+        sizes = (observation_size, *config.hidden_sizes, 1)
+        value = init_network(jax.random.fold_in(critic_key, 2), Value, sizes, code_size)
+    actor = init_network(actor_key, Actor, (observation_size, *config.hidden_sizes, 2 * action_size), code_size)
     sizes = (observation_size + action_size, *config.hidden_sizes, 1)
-    critic = jax.vmap(lambda key: init_network(key, Critic, sizes))(jax.random.split(critic_key, 2))
+    critic = jax.vmap(lambda key: init_network(key, Critic, sizes, code_size))(jax.random.split(critic_key, 2))
     log_alpha = jnp.log(jnp.asarray(config.initial_temperature, jnp.float32))
     moved, third = (critic, log_alpha) if value is None else (value, value)
     optimizer = _optimizer(config)
