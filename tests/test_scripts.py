@@ -174,7 +174,7 @@ def test_readme_holds_the_results_of_the_committed_runs() -> None:
 
 def test_the_dynamics_section_compares_both_evaluations_and_says_how_exactly_the_arm_moves() -> None:
     script = load("eval/readme_results.py")
-    kinematic, dynamic = (json.loads((script.FOLDER / f"{name}.json").read_text()) for name in ("teapot", "plate"))
+    kinematic, dynamic = (json.loads((script.FOLDER / f"{name}.json").read_text()) for name in ("teapot", "gear"))
     moves = {"planned": 499, "rest_error_micrometre_median": 1.25, "rest_error_micrometre_max": 3.75}
     text = script.dynamics_section(kinematic, dynamic, moves)
     row = next(line for line in text.splitlines() if line.startswith("| rotational error, mean"))
