@@ -111,6 +111,8 @@ def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
         ("video {out} --out {out}.mp4", "no run in"),
         ("reach --out {out} --radius -1", "--radius is -1"),
         ("reach --out {out} --mesh-scale 0", "--mesh-scale is 0"),
+        ("reach --out {out} --mesh-up up", "--mesh-up.*auto.*-z"),
+        ("train --out {out} --scene.mesh-up w", "--scene.mesh-up.*auto.*-z"),
         ("info --bogus", "--bogus"),
         ("train --out {out} --preset=", "the value of --preset is empty"),
         ("train --out= --preset smoke", "the value of --out is empty"),

@@ -31,6 +31,7 @@ def test_presets_keep_the_task_of_the_thesis(name):
     [
         (lambda: SceneConfig(radius=-0.1), "SceneConfig.radius", "-0.1"),
         (lambda: SceneConfig(image_size=100), "SceneConfig.image_size", "100"),
+        (lambda: SceneConfig(mesh_up="up"), "SceneConfig.mesh_up", "up"),
         (lambda: SceneConfig(radius=float("nan")), "SceneConfig.radius", "nan"),
         (lambda: EncoderConfig(input="sound"), "EncoderConfig.input", "sound"),
         (lambda: EncoderConfig(bootstrap_fraction=0.0), "EncoderConfig.bootstrap_fraction", "0.0"),

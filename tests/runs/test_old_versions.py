@@ -113,3 +113,8 @@ def test_the_encoder_of_a_run_of_version_0_2_0_has_the_arrays_that_this_version_
     leaves = jax.tree_util.tree_leaves_with_path(state)
     arrays = {jax.tree_util.keystr(path, simple=True, separator="."): list(leaf.shape) for path, leaf in leaves}
     assert arrays == stored["encoder"]
+
+
+def test_a_run_of_version_0_2_0_keeps_its_mesh_as_it_lay(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps(json.loads(RUN_OF_0_2_0.read_text())["config"]))
+    assert runs.read_config(tmp_path).scene.mesh_up == "z"

@@ -82,6 +82,63 @@ def test_a_faulty_mesh_and_an_unknown_name_raise_an_error(tmp_path):
         build_scene(SceneConfig(arm="kuka"))
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["part.step", "part.STP", "part.iges", "part.fbx", "part.usdz", "part.sldprt", "part.blend", "part.3ds", "part."],
+)
+def test_a_format_that_cannot_be_read_is_named_with_those_that_can(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(b"ISO-10303-21;")
+    with pytest.raises(SceneError, match=r"the format '.*' cannot be read; give MJCF .*STL.*GLB.*export"):
+        build_scene(SceneConfig(object=str(path)))
+
+
+@pytest.mark.parametrize("part", ["arm", "obstacles"])
+def test_a_mesh_in_place_of_a_model_is_refused_with_a_remedy(tmp_path, part):
+    path = tmp_path / "part.stl"
+    path.write_bytes(bytes(84))
+    with pytest.raises(SceneError, match=rf"{part} file .*format '.stl' cannot be read; give MJCF .* name mesh files"):
+        build_scene(SceneConfig(**{part: str(path)}))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("part.glb", b"glTF" + bytes(40), "no glTF 2.0 file.*export it again"),
+        ("part.gltf", b"{", "no glTF 2.0 file.*export it again"),
+        ("part.gltf", b"[]", "no glTF 2.0 file; export it again"),
+        (
+            "part.gltf",
+            b'{"asset": {"version": "2.0"}, "extensionsUsed": ["KHR_draco_mesh_compression"]}',
+            r"compressed \(Draco\); export it without mesh compression",
+        ),
+        ("part.3mf", b"no archive", "no 3MF file.*export it again"),
+        ("part.dae", b"no xml", "not a readable mesh.*export it again|no COLLADA file.*export it again"),
+        ("part.msh", b"$MeshFormat", "no MSH file of MuJoCo.*export it as OBJ, STL or GLB"),
+        ("part.obj", b"v 0 0 0\nv 1 0 0\n", "no triangle; export a surface"),
+        ("part.obj", b"v 0 0 0\nv .1 0 0\nv 0 .1 nan\nf 1 2 3\n", "not finite; repair it"),
+    ],
+)
+def test_a_damaged_mesh_file_is_refused_with_a_remedy(tmp_path, name, content, words):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(SceneError, match=rf"object file '.*{name}' cannot be loaded: .*{words}") as caught:
+        build_scene(SceneConfig(object=str(path)))
+    assert "\n" not in str(caught.value)
+
+
+FLEX = """<mujoco><worldbody><body name="soft"><geom size="0.01"/><flexcomp name="cloth" type="grid" count="3 3 1"
+spacing=".02 .02 .02" radius=".001" mass=".1"><edge equality="true"/></flexcomp></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("part", ["object", "obstacles"])
+def test_a_flex_is_refused_by_name_and_by_the_file_that_holds_it(tmp_path, part):
+    path = tmp_path / "soft.xml"
+    path.write_text(FLEX)
+    with pytest.raises(SceneError, match=rf"{part} file '.*soft\.xml': flex 'cloth' .*; replace it by a mesh geom"):
+        build_scene(SceneConfig(**{part: str(path)}))
+
+
 OBJECT_WITH_SYMMETRY = """<mujoco><custom><numeric name="symmetry" data="{data}"/></custom>
 <worldbody><body><geom size="0.03"/></body></worldbody></mujoco>"""
 

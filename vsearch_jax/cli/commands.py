@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from vsearch_jax.config import PRESETS, Config, SceneConfig
+from vsearch_jax.config import PRESETS, Config, SceneConfig, UpAxis
 
 DEFAULT_PRESET = "cpu"
 
@@ -100,6 +100,8 @@ class Reach:
     """Height of the view sphere's centre above the table in m."""
     mesh_scale: float = SceneConfig.mesh_scale
     """Length in m of one unit of the object's mesh file."""
+    mesh_up: UpAxis = SceneConfig.mesh_up
+    """Axis of the object's mesh file that points up. auto: y for GLB and GLTF, as the file says for DAE, else z."""
 
 
 @dataclasses.dataclass(frozen=True)

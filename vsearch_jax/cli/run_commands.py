@@ -137,6 +137,7 @@ def _reach(command: Reach) -> None:
         radius=command.radius,
         center_height=command.center_height,
         mesh_scale=command.mesh_scale,
+        mesh_up=command.mesh_up,
     )
     make_new_folder(command.out)
     with Console().status("computing what the arm reaches"):

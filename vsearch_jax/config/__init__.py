@@ -5,7 +5,7 @@ A `Config` is the static argument of `jax.jit`, the source of the command-line o
 """
 
 from vsearch_jax.config.motion import IKConfig, PlanningConfig
-from vsearch_jax.config.parts import EncoderConfig, EnvConfig, EvaluationConfig, SceneConfig
+from vsearch_jax.config.parts import EncoderConfig, EnvConfig, EvaluationConfig, SceneConfig, UpAxis
 from vsearch_jax.config.searchers import CMAESConfig, RandomSearchConfig, SACConfig
 from vsearch_jax.config.validation import ConfigError
 from vsearch_jax.config.whole import PRESETS, Config
@@ -23,4 +23,5 @@ __all__ = [
     "RandomSearchConfig",
     "SACConfig",
     "SceneConfig",
+    "UpAxis",
 ]

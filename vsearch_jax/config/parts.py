@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from vsearch_jax.config.validation import require, require_finite, require_positive, require_unit
+
+UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+"""Axis of a mesh file that points up; auto: as the file's format defines it."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +21,8 @@ class SceneConfig:
     """Name of an object in xml/objects, or path of an MJCF or mesh file."""
     mesh_scale: float = 1.0
     """Length of one unit of the object's mesh file, in m. For a file in millimetres it is 0.001."""
+    mesh_up: UpAxis = "auto"
+    """Axis of the object's mesh file that points up. auto: y for GLB and GLTF, as the file says for DAE, else z."""
     is_mesh_recentred: bool = True
     """Whether the object's mesh is moved over the origin and onto the table. If not, it keeps the file's position."""
     obstacles: str | None = None
@@ -38,6 +43,7 @@ class SceneConfig:
     def __post_init__(self) -> None:
         require_positive(self, "mount_height", "radius", "image_size", "mesh_scale")
         require_finite(self, "center_height", "table_clearance")
+        require(self, "mesh_up", self.mesh_up in get_args(UpAxis), ", ".join(get_args(UpAxis)))
         require(self, "symmetry", self.symmetry is None or self.symmetry >= 0, "0 or more")
         require(self, "center_height", self.center_height >= 0.0, "0 or more")
         require(self, "table_clearance", self.table_clearance >= 0.0, "0 or more")

@@ -24,7 +24,7 @@ _DROPPED = {UNVERSIONED: ("replay.data.truncated",)}
 """For each version: arrays that no later version reads."""
 
 _LATER_FIELDS: dict[str, dict[str, object]] = {
-    "scene": {"symmetry": None},
+    "scene": {"symmetry": None, "mesh_up": "z"},
     "encoder": {
         "loss": "autoencoder",
         "intensity": "linear",

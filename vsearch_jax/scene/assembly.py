@@ -81,9 +81,10 @@ def build_scene(config: SceneConfig) -> Scene:
 
     - The arm's base hangs from the mount. The +z axis of the base points down.
     - The object is fixed at the world's origin. The joints of the object's file are removed.
-    - A mesh (OBJ, STL, MSH, PLY, GLB, GLTF, OFF) is moved: its lowest point onto the table, the middle of its bounding
-      box above the origin. `is_mesh_recentred=False` keeps the mesh where its file puts it. Holes, and faces without
-      area, are logged.
+    - A mesh (OBJ, STL, PLY, GLB, GLTF, DAE, 3MF, OFF, MSH) is turned: its up axis (`mesh_up`) to +z. It is moved: its
+      lowest point onto the table, the middle of its bounding box above the origin. `is_mesh_recentred=False` keeps the
+      mesh where its file puts it. Each material is a geom. Holes, faces without area, and what cannot be drawn, are
+      logged.
 
     Args:
       config: names or paths of arm, object and obstacles; mount height in m; view sphere.
@@ -94,7 +95,8 @@ def build_scene(config: SceneConfig) -> Scene:
         - The arm has no site `tcp`, no camera `wrist`, or no joint that moves the camera.
         - The arm has a ball joint, or a free joint that moves the camera. (Free joints of loose parts are removed.)
         - The camera is orthographic, or its sensor is not square and centred.
-        - The object has no geom, or it is a mesh that is too large or too small, or its symmetry is no whole number.
+        - The object is of an unknown format, it has no geom, or its symmetry is no whole number.
+        - The object is a mesh that is too large or too small.
         - A geom that the arm could touch is a plane.
     """
     arm_path, object_path = find_file("arm", config.arm), find_file("object", config.object)
@@ -211,5 +213,6 @@ def _put_model(model: mujoco.MjModel) -> mjx.Model:
         return mjx.put_model(without_contacts)
     except NotImplementedError as error:
         raise SceneError(
-            f"MJX does not support a feature of the model: {one_line(error)}; remove it from the arm's file"
+            f"MJX does not support a feature of the model: {one_line(error)}; remove it from the file of the arm, the "
+            "object or the obstacles"
         ) from error

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from importlib import resources
 from pathlib import Path
 
 import mujoco
-import numpy as np
 
 from vsearch_jax.config import SceneConfig
-from vsearch_jax.scene.meshes import MESH_SUFFIXES, MeshError, check_mesh, is_read_by_mujoco, read_mesh
+from vsearch_jax.scene.meshes import FORMAT_NAMES, MESH_SUFFIXES, MeshError, load_mesh
 
 TCP_SITE = "tcp"
 WRIST_CAMERA = "wrist"
-
-_LOG = logging.getLogger(__name__)
+# Models that MuJoCo reads.
+_MODEL_SUFFIXES = (".xml", ".urdf", ".mjz")
 
 
 class SceneError(ValueError):
@@ -70,11 +68,25 @@ def find_file(part: str, name: str) -> Path:
 
 def _load_mjcf(part: str, path: Path) -> mujoco.MjSpec:
     """Loads an MJCF file. Compiles it alone, so that an error message names the faulty file."""
+    if path.suffix.lower() not in _MODEL_SUFFIXES:
+        meshes = (
+            f", or a mesh as {FORMAT_NAMES} (CAD programs export STEP and IGES as STL or GLB, Blender exports FBX and "
+            "USD as GLB)"
+        )
+        raise SceneError(
+            f"{part} file {str(path)!r}: the format {path.suffix!r} cannot be read; give MJCF (.xml)"
+            f"{meshes if part == 'object' else ', in which geoms may name mesh files'}"
+        )
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         spec.compile()
     except ValueError as error:
         raise SceneError(f"{part} file {str(path)!r} cannot be loaded: {one_line(error)}; correct it") from error
+    if spec.flexes:
+        raise SceneError(
+            f"{part} file {str(path)!r}: flex {spec.flexes[0].name!r} cannot be drawn or simulated; replace it by a "
+            "mesh geom, or remove it from this file"
+        )
     return spec
 
 
@@ -124,23 +136,20 @@ def load_object(path: Path, config: SceneConfig) -> mujoco.MjSpec:
 
     Args:
       path: an MJCF or mesh file.
-      config: scale and placement of a mesh; radius in m of the view sphere, which is the maximum size of a mesh.
+      config: scale, up axis and placement of a mesh. The radius in m of the view sphere is its maximum size.
 
     Returns:
       The object, without joints.
 
     Raises:
-      SceneError: the file cannot be loaded, it has no geom, or it is a mesh that is too large or too small.
+      SceneError: the file cannot be loaded, its format is unknown, it has no geom, or it is a mesh that is too large
+        or too small.
     """
     if path.suffix.lower() in MESH_SUFFIXES:
         try:
-            return _load_mesh(path, config)
+            return load_mesh(path, config)
         except MeshError as error:
             raise SceneError(f"object file {str(path)!r} cannot be loaded: {one_line(error)}") from error
-        except ValueError as error:  # MuJoCo's message names no remedy.
-            raise SceneError(
-                f"object file {str(path)!r} cannot be loaded: {one_line(error)}; export it again"
-            ) from error
     spec = load_static("object", path)
     if not spec.geoms:
         raise SceneError(f"object file {str(path)!r} has no geom, so no camera can see it; add a geom")
@@ -190,39 +199,6 @@ def load_static(part: str, path: Path) -> mujoco.MjSpec:
     for joint in list(spec.joints):
         spec.delete(joint)
     return spec
-
-
-def _load_mesh(path: Path, config: SceneConfig) -> mujoco.MjSpec:
-    """Loads a mesh file as one geom, checks it, and moves it onto the table if the config says so."""
-    spec = mujoco.MjSpec()
-    # The object does not move, so its inertia has no effect. The inertia of a shell exists for meshes with holes, too.
-    mesh = spec.add_mesh(name="mesh", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    if is_read_by_mujoco(path):
-        mesh.file = str(path)
-    else:
-        vertices, faces = read_mesh(path)
-        mesh.uservert, mesh.userface = vertices.reshape(-1), faces.reshape(-1)
-    mesh.scale = [config.mesh_scale] * 3
-    geom = spec.worldbody.add_body(name="mesh").add_geom(
-        name="mesh", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", rgba=[0.75, 0.55, 0.35, 1.0]
-    )
-    model = spec.compile()
-    vertices = _vertices_in_file_frame(model)
-    report = check_mesh(vertices, model.mesh_face, config.radius)
-    if report.num_degenerate or report.num_open_edges:
-        _LOG.warning("object file %r: %s", str(path), report)
-    if config.is_mesh_recentred:
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        geom.pos = [-(low[0] + high[0]) / 2.0, -(low[1] + high[1]) / 2.0, -low[2]]
-    return spec
-
-
-def _vertices_in_file_frame(model: mujoco.MjModel) -> np.ndarray:
-    """Returns f64[V, 3] m, the scaled vertices of the model's first mesh in the frame of its file."""
-    # MuJoCo moved the vertices into the frame of the mesh's inertia.
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, model.mesh_quat[0])
-    return model.mesh_vert @ rotation.reshape(3, 3).T + model.mesh_pos[0]
 
 
 def one_line(error: Exception) -> str:
