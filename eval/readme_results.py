@@ -21,7 +21,6 @@ import vsearch_jax as vs
 from vsearch_jax.report.summary import Results, false_positive_warning
 from vsearch_jax.report.table import table_rows
 from vsearch_jax.runs import write_atomically
-from vsearch_jax.runs.old_versions import with_later_fields
 from vsearch_jax.search import LABELS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -66,7 +65,7 @@ def results_section(results: Results) -> str:
 
 def _options(results: Results) -> str:
     """Returns the options of `vsearch train` that differ from the preset `cpu`, and the seed."""
-    config, usual = with_later_fields(results["config"]), json.loads(json.dumps(vs.Config.preset("cpu").to_dict()))
+    config, usual = results["config"], json.loads(json.dumps(vs.Config.preset("cpu").to_dict()))
     options = [f"--object {config['scene']['object']}"]
     for section, values in config.items():
         for field, value in values.items() if isinstance(values, dict) else ():
