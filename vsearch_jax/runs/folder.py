@@ -11,6 +11,7 @@ import os
 import shlex
 import shutil
 import time
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +33,8 @@ MAX_SEED = 2**32 - 1
 """Largest seed. JAX keeps 32 bits of a seed, so a larger seed would give the same run as a smaller one."""
 
 _REMEDY = "restore the file from a copy, or train into another folder"
+_UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, of bytes that are no text, and of separators of lines."""
 _NUM_REMOVALS, _SECONDS_BETWEEN_REMOVALS = 40, 0.05
 
 
@@ -45,37 +48,93 @@ class ConfigFileError(ConfigError):
 
 def resume_command(run: Path) -> str:
     """Returns the command line that continues a run, for error messages: it can be pasted into a shell."""
-    return f"vsearch train --out {shlex.quote(str(run))} --resume"
+    path = f"./{run}" if str(run).startswith("-") else str(run)  # An option would start with a hyphen.
+    return f"vsearch train --out {shlex.quote(path)} --resume"
 
 
 def make_new_folder(folder: Path) -> None:
     """Makes the folder for new files, such as a run or an export. An existing empty folder is accepted.
 
     Raises:
-      RunError: the folder is not empty or cannot be made, or `folder` is a file.
+      RunError: the folder is not empty or cannot be made, or `folder` is a file, or its name cannot be printed.
     """
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+    _check_name("folder", folder)
+    if _exists("folder", folder) and not (folder.is_dir() and not any(folder.iterdir())):
         is_run = (folder / CONFIG).is_file()
         hint = f", or continue the run in it: {resume_command(folder)}" if is_run else ""
         raise RunError(f"`folder` is {folder}, which exists; name another folder{hint}")
     _make_folder("folder", folder, folder)
 
 
-def check_new_file(path: Path, suffix: str) -> None:
-    """Checks that a new file can be made at `path`, and makes the folder for it.
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[None]:
+    """Makes the folder for new files, which the `with` block writes. An existing empty folder is accepted.
+
+    If the block raises an exception, the folders that were made here are removed again, unless they hold a file.
+
+    Raises:
+      RunError: the folder is not empty or cannot be made, or `folder` is a file, or its name cannot be printed.
+    """
+    with _removed_after_error(folder):
+        make_new_folder(folder)
+        yield
+
+
+@contextlib.contextmanager
+def new_file(path: Path, suffix: str) -> Iterator[None]:
+    """Checks that a new file can be made at `path`, and makes the folder for it. The `with` block writes the file.
+
+    If the block raises an exception, the folders that were made here are removed again, unless they hold a file.
 
     Args:
       path: the file to be made.
       suffix: how the name of the file must end, for example ".mp4".
 
     Raises:
-      RunError: something exists at `path`, the name does not end in `suffix`, or the folder cannot be made.
+      RunError: something exists at `path`, the name does not end in `suffix` or cannot be printed, or the folder cannot
+        be made.
     """
+    _check_name("path", path)
     if path.suffix.lower() != suffix:
         raise RunError(f"`path` is {path}; name a file that ends in {suffix}")
-    if path.exists():
+    if _exists("path", path):
         raise RunError(f"`path` is {path}, which exists; name another file")
-    _make_folder("path", path, path.parent)
+    with _removed_after_error(path.parent):
+        _make_folder("path", path, path.parent)
+        yield
+
+
+@contextlib.contextmanager
+def _removed_after_error(folder: Path) -> Iterator[None]:
+    """Removes `folder` and its parents after an error, as far as they did not exist before and are empty."""
+    missing = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+    try:
+        yield
+    except BaseException:
+        for path in missing:
+            with contextlib.suppress(OSError):  # It holds a file, or it was not made.
+                path.rmdir()
+        raise
+
+
+def _check_name(option: str, path: Path) -> None:
+    """Raises RunError if a path cannot be printed in one line; an error names the option that gave `path`."""
+    if any(unicodedata.category(character) in _UNPRINTABLE for character in str(path.absolute())):
+        raise RunError(
+            f"`{option}` is {ascii(str(path))}, a path with a line break, a control character or a byte that is no "
+            "text; name another path"
+        )
+
+
+def _exists(option: str, path: Path) -> bool:
+    """Returns whether something exists at `path`; an error names the option that gave `path`."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        raise _unusable(option, path, f"the system refuses it ({error.strerror})") from error
+    return True
 
 
 def _make_folder(option: str, value: Path, folder: Path) -> None:
@@ -83,29 +142,32 @@ def _make_folder(option: str, value: Path, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        reason = f"the folder {folder} cannot be made ({error.strerror})"
-        raise RunError(f"`{option}` is {value}, but {reason}; name another folder") from error
+        raise _unusable(option, value, f"the folder {folder} cannot be made ({error.strerror})") from error
+
+
+def _unusable(option: str, value: Path, reason: str) -> RunError:
+    return RunError(f"`{option}` is {value}, but {reason}; name another folder")
 
 
 @contextlib.contextmanager
 def new_run_folder(run: Path) -> Iterator[None]:
     """Makes the folder of a new run for a `with` block, which writes the run's first files.
 
-    If the block raises an exception, config and checkpoints are removed. The folder is then empty again.
+    If the block raises an exception, config and checkpoints are removed, and then the folder if it was made here.
 
     Args:
       run: the new folder. An existing empty folder is accepted.
 
     Raises:
-      RunError: the folder is not empty, or `run` is a file.
+      RunError: the folder is not empty, or `run` is a file, or its name cannot be printed.
     """
-    make_new_folder(run)
-    try:
-        yield
-    except BaseException:
-        (run / CONFIG).unlink(missing_ok=True)
-        _remove(run / CHECKPOINTS)
-        raise
+    with new_folder(run):
+        try:
+            yield
+        except BaseException:
+            (run / CONFIG).unlink(missing_ok=True)
+            _remove(run / CHECKPOINTS)
+            raise
 
 
 def _remove(folder: Path) -> None:
