@@ -155,12 +155,16 @@ def _check_config(folder: Path, saved: Mapping[str, object], config: Config, ver
 def _check_arrays(
     folder: Path, found: Mapping[str, Described], expected: Mapping[str, Described], version: str
 ) -> None:
+    own = _own_version()
+    # In the same version, only another arm or object makes another shape.
+    remedy = f"use vsearch_jax {version} to read it"
+    if version == own:
+        remedy = "restore the files of arm and object as they were when the run was trained"
     for name in [*expected, *found]:
         if found.get(name) != expected.get(name):
             raise CheckpointError(
-                f"checkpoint {folder}, written by vsearch_jax {version}, does not fit vsearch_jax {_own_version()}: "
-                f"{name} is {_text(found.get(name))} in the checkpoint and {_text(expected.get(name))} now; use "
-                f"vsearch_jax {version} to read it"
+                f"checkpoint {folder}, written by vsearch_jax {version}, does not fit vsearch_jax {own}: "
+                f"{name} is {_text(found.get(name))} in the checkpoint and {_text(expected.get(name))} now; {remedy}"
             )
 
 

@@ -12,7 +12,7 @@ import shlex
 import shutil
 import time
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from vsearch_jax.config import Config, ConfigError
@@ -32,6 +32,8 @@ EVENTS = "tensorboard"
 MAX_SEED = 2**32 - 1
 """Largest seed. JAX keeps 32 bits of a seed, so a larger seed would give the same run as a smaller one."""
 
+_SEED, _FILES = "seed", "scene_files"
+"""What `config.json` holds beside the config."""
 _REMEDY = "restore the file from a copy, or train into another folder"
 _UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, of bytes that are no text, and of separators of lines."""
@@ -121,7 +123,7 @@ def _check_name(option: str, path: Path) -> None:
     """Raises RunError if a path cannot be printed in one line; an error names the option that gave `path`."""
     if any(unicodedata.category(character) in _UNPRINTABLE for character in str(path.absolute())):
         raise RunError(
-            f"`{option}` is {ascii(str(path))}, a path with a line break, a control character or a byte that is no "
+            f"`{option}` is {str(path)!a}, a path with a line break, a control character or a byte that is no "
             "text; name another path"
         )
 
@@ -205,18 +207,19 @@ def lock_folder(run: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def write_config(run: Path, config: Config, seed: int) -> None:
-    """Writes config and seed of a run to `config.json` in the run's folder.
+def write_config(run: Path, config: Config, seed: int, files: Mapping[str, object]) -> None:
+    """Writes config and seed of a run, and the fingerprint of its scene, to `config.json` in the run's folder.
 
     Args:
       run: folder of the run.
       config: the run's config.
       seed: the run's seed, from 0 to `MAX_SEED`.
+      files: fingerprint of the scene's files at the start of the run, from `scene.scene_fingerprint`; empty if unknown.
 
     Raises:
       OSError: the disk is full or not writable.
     """
-    write_atomically(run / CONFIG, json.dumps({"seed": seed, **config.to_dict()}, indent=2) + "\n")
+    write_atomically(run / CONFIG, json.dumps({_SEED: seed, **config.to_dict(), _FILES: files}, indent=2) + "\n")
 
 
 def read_config(run: Path) -> Config:
@@ -226,7 +229,7 @@ def read_config(run: Path) -> Config:
       RunError: the folder holds no run.
       ConfigFileError: `config.json` is damaged, or a value in it is out of range.
     """
-    values = {name: value for name, value in _read_json(run).items() if name != "seed"}
+    values = {name: value for name, value in _read_json(run).items() if name not in (_SEED, _FILES)}
     try:
         return Config.from_dict(with_later_fields(values))
     except (ValueError, TypeError, AttributeError) as error:  # a value is out of range or has a wrong type
@@ -240,10 +243,23 @@ def read_seed(run: Path) -> int:
       RunError: the folder holds no run.
       ConfigFileError: `config.json` is damaged, or the seed is out of range.
     """
-    seed = _read_json(run).get("seed")
+    seed = _read_json(run).get(_SEED)
     if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
         raise ConfigFileError(f"{run / CONFIG}: seed is {seed!r}; allowed: 0 to {MAX_SEED}; {_REMEDY}")
     return seed
+
+
+def read_files(run: Path) -> dict[str, object]:
+    """Reads the fingerprint of a run's scene from `config.json`; it is empty in runs of versions before 0.3.0.
+
+    Raises:
+      RunError: the folder holds no run.
+      ConfigFileError: `config.json` is damaged.
+    """
+    files = _read_json(run).get(_FILES, {})
+    if not isinstance(files, dict):
+        raise ConfigFileError(f"{run / CONFIG}: {_FILES} is no JSON object; {_REMEDY}")
+    return files
 
 
 def _read_json(run: Path) -> dict[str, object]:

@@ -27,7 +27,7 @@ NUM_KEPT = 2
 """Number of checkpoints kept in a run's folder: the last one and the one before."""
 
 _STATE, _ABOUT = "state", "about"
-_JSON_FILES = ("_CHECKPOINT_METADATA", f"{_STATE}/_METADATA", f"{_ABOUT}/metadata")
+_JSON_FILES = (f"{_ABOUT}/metadata", f"{_STATE}/_METADATA", "_CHECKPOINT_METADATA")
 _PLAIN_PATH = re.compile(r"[\w./ -]*")
 _OS_ERROR = re.compile(r"OS error (\d+)")
 _DAMAGE_ERRNOS = (2, 20, 21)
@@ -152,10 +152,12 @@ def _find_damage(folder: Path) -> str | None:
     with _plain_path(folder / _STATE) as plain:
         base = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{plain}/"}}
         try:
-            for name in _JSON_FILES:
-                json.loads((folder / name).read_text(encoding="utf-8"))
-            names = tensorstore.KvStore.open(base).result().list().result()
-            for name in sorted(key.decode().removesuffix("/.zarray") for key in names if key.endswith(b"/.zarray")):
+            names = _names_of_arrays(folder)
+            stored = set(tensorstore.KvStore.open(base).result().list().result())
+            missing = [name for name in names if f"{name}/.zarray".encode() not in stored]
+            if missing:
+                return f"the array {missing[0]} is missing"
+            for name in names:
                 tensorstore.open({"driver": "zarr", "kvstore": base | {"path": name}}).result().read().result()
         except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
             return _first_line(error)
@@ -165,6 +167,20 @@ def _find_damage(folder: Path) -> str | None:
                 return _first_line(error)
             raise OSError(errno, os.strerror(errno), str(folder)) from error
     return None
+
+
+def _names_of_arrays(folder: Path) -> list[str]:
+    """Returns the names of the arrays that a checkpoint must hold.
+
+    Raises:
+      ValueError: one of the JSON files is damaged.
+      OSError: one of the JSON files is missing, or the system cannot read it.
+    """
+    about, *_ = [json.loads((folder / name).read_text(encoding="utf-8")) for name in _JSON_FILES]
+    try:
+        return [name for name, (shape, _) in about["arrays"].items() if 0 not in shape]  # Orbax stores no empty array.
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{_JSON_FILES[0]} does not list the arrays") from error
 
 
 def _manager(checkpoints: Path) -> ocp.CheckpointManager:

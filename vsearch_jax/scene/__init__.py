@@ -2,6 +2,17 @@
 
 from vsearch_jax.scene.assembly import Scene, build_scene
 from vsearch_jax.scene.files import SceneError, available, xml_folder
+from vsearch_jax.scene.fingerprint import Fingerprint, check_unchanged, scene_fingerprint
 from vsearch_jax.scene.joint_chain import joints_above
 
-__all__ = ["Scene", "SceneError", "available", "build_scene", "joints_above", "xml_folder"]
+__all__ = [
+    "Fingerprint",
+    "Scene",
+    "SceneError",
+    "available",
+    "build_scene",
+    "check_unchanged",
+    "joints_above",
+    "scene_fingerprint",
+    "xml_folder",
+]
