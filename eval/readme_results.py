@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.report.summary import Results, false_positive_warning
 from vsearch_jax.report.table import table_rows
 from vsearch_jax.search import LABELS
@@ -143,4 +144,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    with one_line_errors():
+        main(sys.argv[1:])
