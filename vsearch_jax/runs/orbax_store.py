@@ -78,7 +78,16 @@ def write(run: Path, step: int, arrays: Mapping[str, np.ndarray], about: Mapping
 
 
 def read_about(run: Path, step: int) -> dict[str, object]:
-    """Reads the description of the checkpoint of `step`. Raises as `read_arrays`."""
+    """Reads the description of the checkpoint of `step`.
+
+    Args:
+      run: folder of the run.
+      step: number of iterations done.
+
+    Raises:
+      CheckpointError: the checkpoint is damaged, or orbax cannot read it for another reason.
+      OSError: the system cannot read a file.
+    """
     about = _read(run, step, _ABOUT, ocp.args.JsonRestore())
     assert isinstance(about, dict)  # `write` stores a dictionary
     return about
