@@ -96,11 +96,12 @@ def test_an_arm_that_was_edited_after_the_training_is_named_and_its_speeds_may_b
 ) -> None:
     out, arm = tmp_path / "run", tmp_path / "arm.xml"
     arm.write_text((xml_folder() / "arm" / "ur5e.xml").read_text())
-    main(["train", "--preset", "smoke", "--out", str(out), "--arm", str(arm)])
+    config = Config.preset("smoke")
+    loop.start_run(out, dataclasses.replace(config, scene=dataclasses.replace(config.scene, arm=str(arm))), seed=0)
     whole = arm.read_text()
     arm.write_text(re.sub(r' user="[^"]*"', "", whole))
-    main(["eval", str(out)])
-    arm.write_text(re.sub(r'range="[^"]*"', 'range="-1 1"', whole))
+    loop.resume_run(out, read_config(out))
+    arm.write_text(re.sub(r' range="[^"]*"', ' range="-1 1"', whole))
     before = contents(out)
     for command in (["train", "--out", str(out), "--resume"], ["eval", str(out)], ["video", str(out), "--out=a.mp4"]):
         message = user_error(capsys, *command)
