@@ -31,6 +31,7 @@ from encoder_sections.images import FULL, QUICK, encode_views, train_encoder
 from encoder_sections.measures import measure
 from parts import PARTS, write_part
 from vsearch_jax import report, runs
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.types import EncoderState, ReachabilityMap
 
 LOSSES = {
@@ -195,4 +196,5 @@ def _line(name: str, loss: str, rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    with one_line_errors():
+        main(sys.argv[1:])

@@ -20,6 +20,7 @@ import numpy as np
 
 import vsearch_jax as vs
 from vsearch_jax import report, runs
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.evaluation import record_search
 from vsearch_jax.search import LABELS
 
@@ -68,4 +69,5 @@ if __name__ == "__main__":
     parser.add_argument("--target", type=float, nargs=2, default=(60.0, 55.0), metavar=("AZIMUTH", "ELEVATION"))
     parser.add_argument("--batch-size", type=int, default=125)
     options = parser.parse_args()
-    evaluate(options.run, options.out, options.episodes, tuple(options.target), options.batch_size)
+    with one_line_errors():
+        evaluate(options.run, options.out, options.episodes, tuple(options.target), options.batch_size)

@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 from vsearch_jax import runs
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.export.stablehlo import export
 
 
@@ -34,4 +35,5 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, required=True, help="folder of the files")
     parser.add_argument("--policy", type=int, default=0, help="which of the run's policies")
     options = parser.parse_args()
-    export_run(options.run, options.out, options.policy)
+    with one_line_errors():
+        export_run(options.run, options.out, options.policy)

@@ -29,6 +29,7 @@ import jax
 import vsearch_jax as vs
 from gpu_sections import learning, parity, planning, rendering
 from gpu_sections.measure import Row, Settings
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.types import TrainState
 
@@ -175,4 +176,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    with one_line_errors():
+        sys.exit(main(sys.argv[1:]))

@@ -24,6 +24,7 @@ from jax import Array
 
 import vsearch_jax as vs
 from vsearch_jax import report, runs
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.config import Config
 from vsearch_jax.planning.execution import execute
 from vsearch_jax.types import ReachabilityMap
@@ -96,4 +97,5 @@ def measure_moves(key: Array, reach: ReachabilityMap, config: Config, count: int
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    with one_line_errors():
+        main(sys.argv[1:])

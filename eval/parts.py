@@ -15,6 +15,8 @@ import numpy as np
 import trimesh
 from manifold3d import CrossSection, Manifold
 
+from vsearch_jax.cli.errors import one_line_errors
+
 Size = tuple[float, float, float]
 _SEGMENTS = 48
 """Number of flat faces around a cylinder."""
@@ -118,4 +120,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    with one_line_errors():
+        main(sys.argv[1:])

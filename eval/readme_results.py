@@ -18,6 +18,7 @@ from typing import Any
 import jinja2
 
 import vsearch_jax as vs
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.report.summary import Results, false_positive_warning
 from vsearch_jax.report.table import table_rows
 from vsearch_jax.runs import write_atomically
@@ -180,4 +181,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    with one_line_errors():
+        main(sys.argv[1:])

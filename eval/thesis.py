@@ -29,6 +29,7 @@ import vsearch_jax as vs
 from thesis_sections import figures, policy, tables
 from thesis_sections.searches import experiments, run_experiment
 from vsearch_jax import report, runs
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.types import TrainState
 
 Arrays = dict[str, dict[str, np.ndarray]]
@@ -154,4 +155,5 @@ def _write(out: Path, content: Mapping[str, Any], drawn: Mapping[str, Figure]) -
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    with one_line_errors():
+        main(sys.argv[1:])

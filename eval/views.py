@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import vsearch_jax as vs
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.scene import available
 from vsearch_jax.types import View
 
@@ -32,7 +33,7 @@ def wrist_images(name: str) -> np.ndarray:
 
 
 def main(path: str) -> None:
-    """Writes the picture to `path`: one row for each object, one column for each azimuth."""
+    """Writes the picture to `path`, a PNG file: one row for each object, one column for each azimuth."""
     names = available("objects")
     num_columns, num_rows = len(AZIMUTHS_DEG), len(names)
     figure = Figure(figsize=(num_columns, num_rows), dpi=128)
@@ -42,10 +43,11 @@ def main(path: str) -> None:
             axes.imshow(np.clip(image, 0, 1))
             axes.set_axis_off()
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    figure.savefig(path, format="png")
 
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit("usage: python eval/views.py PICTURE, for example docs/views.png")
-    main(sys.argv[1])
+    with one_line_errors():
+        main(sys.argv[1])

@@ -16,6 +16,7 @@ import numpy as np
 
 import vsearch_jax as vs
 from vsearch_jax import report, runs
+from vsearch_jax.cli.errors import one_line_errors
 from vsearch_jax.evaluation import record_search
 from vsearch_jax.search import LABELS
 
@@ -28,11 +29,7 @@ def train(folder: Path, config: vs.Config, seed: int) -> None:
       config: the run's config.
       seed: of all random numbers of the run.
     """
-    runs.make_new_folder(folder)
-    runs.write_config(folder, config, seed)
-    state = vs.init(jax.random.key(seed), config)
-    runs.save(folder, state, config)
-
+    state = runs.start_run(folder, config, seed)  # makes the folder, calls `vs.init`, saves the first checkpoint
     log = runs.MetricsLog(folder, step=0)
     step = 0
     while step < config.num_iterations:
@@ -73,4 +70,5 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    train(options.out, vs.Config.preset(options.preset), options.seed)
+    with one_line_errors():
+        train(options.out, vs.Config.preset(options.preset), options.seed)

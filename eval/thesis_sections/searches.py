@@ -16,6 +16,7 @@ from vsearch_jax.config import CMAESConfig, Config, RandomSearchConfig
 from vsearch_jax.env import pose_error
 from vsearch_jax.evaluation import initial_views
 from vsearch_jax.evaluation.outcome import Outcome
+from vsearch_jax.evaluation.protocol import check_reached
 from vsearch_jax.evaluation.trials import search_trials
 from vsearch_jax.evaluation.views import ViewRequest, observe_request
 from vsearch_jax.geometry import cosine_similarity, wrap_angle
@@ -116,10 +117,14 @@ def run_experiment(state: TrainState, config: Config, experiment: Experiment) ->
       {label: measures by name}. Each measure is an array of [initial views, runs, ...]; `vsearch_jax.evaluate`
       describes them. `initial_cosine`, `initial_rotation_error` in rad and `initial_translation_error` in m are those
       of the initial view.
+
+    Raises:
+      UnreachableError: inverse kinematics finds no joints for the target view.
     """
     views = (np.deg2rad(np.array(experiment.initial_deg)), np.deg2rad(np.array(experiment.target_deg)))
     views = tuple(View(wrap_angle(jnp.float32(x.T[0])), jnp.float32(x.T[1])) for x in views)
-    outcomes = _run(state, *views, config, tuple(experiment.searchers.values()), experiment.num_runs)
+    outcomes, is_reached = _run(state, *views, config, tuple(experiment.searchers.values()), experiment.num_runs)
+    check_reached(is_reached, experiment.target_deg, state.reach)
     shape = (len(experiment.initial_deg), experiment.num_runs)
     return {
         label: {
@@ -132,8 +137,11 @@ def run_experiment(state: TrainState, config: Config, experiment: Experiment) ->
 @functools.partial(jax.jit, static_argnames=("config", "searchers", "num_runs"))
 def _run(
     state: TrainState, initial: View, target: View, config: Config, searchers: tuple[Searcher, ...], num_runs: int
-) -> list[Outcome]:
-    """Runs the searchers `num_runs` times from each initial view; the views are of f32[V] rad and f32[] rad."""
+) -> tuple[list[Outcome], Array]:
+    """Runs the searchers `num_runs` times from each initial view; the views are of f32[V] rad and f32[] rad.
+
+    Returns the measures of each searcher; and bool[], whether the camera was at the target view.
+    """
     env = vs.ViewSearchEnv(config, state.encoder, state.reach)
     joints_key, search_key = jax.random.split(jax.random.fold_in(state.key, 2**31 - 3))  # a salt of its own
     views = jax.tree.map(lambda x, y: jnp.append(jnp.repeat(x, num_runs), y), initial, target)
@@ -143,8 +151,10 @@ def _run(
     seen = map_in_batches(functools.partial(observe_request, env), requests, config.evaluation.batch_size)
     start, end = jax.tree.map(lambda x: x[:-1], seen), jax.tree.map(lambda x: x[-1], seen)
     methods = tuple(_METHODS[name](settings) for name, settings in searchers)
-    outcomes = search_trials(jax.random.split(search_key, len(methods)), env, methods, start, end)
-    return [outcome | _initial_errors(env, start, end) for outcome in outcomes]
+    keys = jax.random.split(search_key, len(methods))
+    outcomes = search_trials(keys, env, methods, start, end.observation)
+    errors = _initial_errors(env, start.observation, end.observation)
+    return [outcome | errors for outcome in outcomes], end.is_reached
 
 
 def _initial_errors(env: vs.ViewSearchEnv, start: Observation, end: Observation) -> dict[str, Array]:

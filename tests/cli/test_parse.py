@@ -11,6 +11,7 @@ from vsearch_jax.cli.commands import COMMANDS, Export, Train, Video
 from vsearch_jax.cli.main import main
 from vsearch_jax.cli.parse import parse
 from vsearch_jax.config import Config
+from vsearch_jax.runs.folder import write_config
 
 
 def parse_train(*arguments: str) -> Train:
@@ -57,6 +58,15 @@ def test_paths_are_made_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     scene = parse_train("--out", "x", "--object", "part.stl", "--scene.arm", "arms/own.xml").config.scene
     assert scene.object == str(tmp_path / "part.stl")
     assert scene.arm == str(tmp_path / "arms" / "own.xml")
+
+
+def test_the_home_folder_is_expanded_in_every_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert parse_train("--out=~/x").out == tmp_path / "x"
+    assert parse(["video", "~/run", "--out=~/a.mp4"]) == Video(tmp_path / "run", tmp_path / "a.mp4")
+    (tmp_path / "run").mkdir()
+    write_config(tmp_path / "run", Config.preset("thesis"), 0, {})
+    assert parse_train("--out=~/run", "--resume").config == Config.preset("thesis")
 
 
 def test_policy_and_episode_are_numbers() -> None:

@@ -15,6 +15,7 @@ from vsearch_jax.config import Config
 from vsearch_jax.runs import checkpoint, loop
 from vsearch_jax.runs.folder import RunError, lock_folder, read_config, read_seed
 from vsearch_jax.runs.metrics_log import STAGES, read_metrics
+from vsearch_jax.scene import xml_folder
 
 
 @pytest.mark.parametrize(
@@ -24,13 +25,13 @@ from vsearch_jax.runs.metrics_log import STAGES, read_metrics
         ("--arm {out}/own.xml", "--arm is .*own.xml', a file that does not exist"),
     ],
 )
-def test_a_scene_that_cannot_be_built_leaves_the_folder_empty(
+def test_a_scene_that_cannot_be_built_leaves_no_folder(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, option: str, message: str
 ) -> None:
     out = tmp_path / "run"
     command = f"train --preset smoke --out {out} {option.format(out=tmp_path)}"
     assert re.search(message, user_error(capsys, *command.split()))
-    assert not any(out.iterdir())
+    assert not any(tmp_path.iterdir())
 
 
 def test_the_home_of_an_unknown_user_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -92,6 +93,24 @@ def test_an_option_that_a_resumed_run_cannot_take_is_named_and_changes_nothing(
     assert contents(tmp_path) == before
 
 
+def test_an_arm_that_was_edited_after_the_training_is_named_and_its_speeds_may_be_added(
+    fast: None, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out, arm = tmp_path / "run", tmp_path / "arm.xml"
+    arm.write_text((xml_folder() / "arm" / "ur5e.xml").read_text())
+    config = Config.preset("smoke")
+    loop.start_run(out, dataclasses.replace(config, scene=dataclasses.replace(config.scene, arm=str(arm))), seed=0)
+    whole = arm.read_text()
+    arm.write_text(re.sub(r' user="[^"]*"', "", whole))
+    loop.resume_run(out, read_config(out))
+    arm.write_text(re.sub(r' range="[^"]*"', ' range="-1 1"', whole))
+    before = contents(out)
+    for command in (["train", "--out", str(out), "--resume"], ["eval", str(out)], ["video", str(out), "--out=a.mp4"]):
+        message = user_error(capsys, *command)
+        assert f"arm file {str(arm)!r} has changed since this run was trained (changed: arm.xml)" in message
+        assert "restore the files" in message and contents(out) == before
+
+
 @pytest.mark.parametrize("is_target", [True, False])
 def test_an_unreachable_target_or_band_is_drawn(
     fast: None,
@@ -111,7 +130,11 @@ def test_an_unreachable_target_or_band_is_drawn(
     target, band = "--evaluation.target-elevation-deg is 89", "--scene.mount-height 1.355 reaches no elevation at every"
     assert (target if is_target else band) in message
     assert f"{figure} shows" in message
-    assert figure.read_bytes().startswith(b"\x89PNG") and not any(out.iterdir())
+    assert figure.read_bytes().startswith(b"\x89PNG") and not out.exists()
+    figure.write_text("mine")
+    second = tmp_path / "run-reachability-2.png"
+    assert f"{second} shows" in user_error(capsys, "train", *options, "--out", str(out))
+    assert figure.read_text() == "mine" and second.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32])
@@ -119,7 +142,7 @@ def test_a_seed_out_of_range_is_named(capsys: pytest.CaptureFixture[str], tmp_pa
     out = tmp_path / "run"
     message = user_error(capsys, "train", "--preset", "smoke", "--out", str(out), f"--seed={seed}")
     assert f"--seed is {seed}; allowed: 0 to 4294967295" in message
-    assert not any(out.iterdir())
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("seed", ["x", -1, 2**32, None])
@@ -170,7 +193,7 @@ def test_a_full_disk_is_one_line_and_keeps_what_was_saved(tmp_path: Path, file_l
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("vsearch: error: cannot write") and str(out) in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
-    assert any(out.iterdir()) == is_started
+    assert out.exists() == is_started
     assert checkpoint.latest_step(out) == (24 if is_started else None)
 
 

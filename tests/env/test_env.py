@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from brax.envs.wrappers.training import wrap
+from brax.envs.wrappers.training import EpisodeWrapper, wrap
 from scipy.spatial.transform import Rotation
 
 import vsearch_jax as vs
@@ -118,12 +118,26 @@ def test_unreachable_view_gives_reward_minus_two_and_the_arm_stays(env, reset, s
     assert state.pipeline_state.num_steps == before.pipeline_state.num_steps + 1
 
 
-def test_step_after_done_changes_nothing(reset, step):
-    state = reset(jax.random.key(4)).replace(done=jnp.ones(()))
-    after = step(state, jnp.array([1.0, 0.0]))
-    jax.tree.map(np.testing.assert_array_equal, after, state)
-    running = step(state.replace(done=jnp.zeros(())), jnp.array([1.0, 0.0]))
+def test_an_action_of_nan_is_an_unreachable_step(reset, step):
+    state = reset(jax.random.key(4))
+    for action in ([jnp.nan, 0.0], [0.5, jnp.nan]):
+        after = step(state, jnp.array(action))
+        assert (after.reward, after.info["is_reachable"], after.metrics["unreachable"]) == (-2.0, 0.0, 1.0)
+        np.testing.assert_array_equal(after.obs, state.obs)
+        assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(after))
+
+
+def test_a_step_after_the_end_earns_and_costs_nothing_and_the_arm_stays(env, reset, step):
+    state = reset(jax.random.key(4))
+    running = step(state, jnp.array([1.0, 0.0]))
     assert running.metrics["joint_travel"] > 0.0 and running.pipeline_state.num_steps == 1
+    found = step(env.start(state.pipeline_state.observation, state.pipeline_state.observation), jnp.zeros(2))
+    assert (found.reward, found.done) == (2.0, 1.0)
+    after = step(found, jnp.array([1.0, 0.0]))
+    assert (after.reward, after.done, after.info["terminated"]) == (0.0, 1.0, 1.0)
+    assert (after.metrics["joint_travel"], after.metrics["motion_time"], after.metrics["unreachable"]) == (0, 0, 0)
+    for part in ("pipeline_state", "obs", "info"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(after, part), getattr(found, part))
 
 
 def test_reaching_the_threshold_terminates_with_reward_two(env, reset, step):
@@ -147,6 +161,25 @@ def test_last_step_sets_truncated_but_not_done(reset, step):
         truncated.append(float(state.info["truncated"]))
         assert state.done == 0.0
     assert truncated == [0.0] * (CONFIG.env.episode_length - 1) + [1.0]
+
+
+@pytest.mark.parametrize("name", ["jax_enable_x64", "jax_debug_nans"])
+def test_a_setting_of_jax_with_which_the_task_does_not_run_is_named(name: str):
+    jax.config.update(name, True)
+    try:
+        with pytest.raises(ConfigError, match=rf"{name.upper()} of JAX is on, but .*; switch it off: {name.upper()}=0"):
+            vs.ViewSearchEnv(CONFIG)
+    finally:
+        jax.config.update(name, False)
+
+
+@pytest.mark.slow
+def test_repeated_actions_of_brax_pay_the_success_once(env, with_implicit_promotion):
+    wrapped = jax.jit(EpisodeWrapper(env, episode_length=20, action_repeat=4).step)
+    state = EpisodeWrapper(env, 20, 4).reset(jax.random.key(5))
+    episode = state.pipeline_state
+    at_target = state.replace(pipeline_state=episode.replace(target=episode.observation))
+    assert wrapped(at_target, jnp.zeros(2)).reward == 2.0
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +16,11 @@ from scipy.spatial.transform import Rotation
 import vsearch_jax as vs
 from vsearch_jax import evaluation
 from vsearch_jax.config import ConfigError, EvaluationConfig
+from vsearch_jax.env import UnreachableError, zero_observation
+from vsearch_jax.evaluation import protocol
 from vsearch_jax.scene import build_scene
 from vsearch_jax.search import BLACK_BOX, LABELS, POLICIES
+from vsearch_jax.types import View
 
 CONFIG = vs.Config.preset("smoke")
 
@@ -156,3 +161,40 @@ def test_error_names_a_target_that_the_arm_cannot_reach(state):
     config = dataclasses.replace(CONFIG, evaluation=dataclasses.replace(CONFIG.evaluation, target_elevation_deg=89.0))
     with pytest.raises(ConfigError, match=r"target_elevation_deg is 89, which the arm cannot reach.*allowed"):
         vs.evaluate(state, config)
+
+
+def test_views_for_which_inverse_kinematics_fails_are_flagged():
+    """A stand-in for the task, which reaches no elevation between 0.9 and 1.0; the target is one of them."""
+
+    def resolve_view(view, qpos, is_fixed):
+        is_reached = jnp.abs(view.elevation - 0.95) > 0.05
+        return view, qpos, is_reached | ~is_fixed
+
+    task = SimpleNamespace(
+        config=CONFIG,
+        reach=SimpleNamespace(band=jnp.array([0.8, 1.2])),
+        random_joints=lambda key: jnp.zeros(2),
+        random_view=lambda key: (View(*jax.random.uniform(key, (2,))), jnp.zeros(2)),
+        resolve_view=resolve_view,
+        observe_view=lambda view, qpos: dataclasses.replace(zero_observation(3, 2), view=view, code=jnp.ones(3)),
+    )
+    keys = jax.random.split(jax.random.key(0), (1, 4, 2))
+    observe = jax.jit(lambda *keys: protocol.observe_known_views(*keys, cast(vs.ViewSearchEnv, task), CONFIG))
+    known = observe(jax.random.key(1), keys)
+    assert 0.9 < float(known.target.observation.view.elevation) < 1.0
+    for seen in known[:3]:
+        elevation = np.asarray(seen.observation.view.elevation)
+        np.testing.assert_array_equal(seen.is_reached, np.abs(elevation - 0.95) > 0.05)
+        assert (np.asarray(seen.observation.code) == 1.0).all()
+    assert 0 < np.sum(known.grid.is_reached) < known.grid.is_reached.size
+    assert known.ends.code.shape == (1, 4, 2, 3)
+
+
+def test_an_evaluation_without_a_target_image_is_an_error(state, monkeypatch: pytest.MonkeyPatch):
+    for is_reached in (True, False):
+        monkeypatch.setattr(protocol, "_evaluate", lambda *_, flag=is_reached: ({"sac": {}}, jnp.bool_(flag)))
+        if is_reached:
+            assert vs.evaluate(state, CONFIG) == {"sac": {}}
+        else:
+            with pytest.raises(UnreachableError, match=r"target_azimuth_deg 60 .* evaluate with another target"):
+                vs.evaluate(state, CONFIG)

@@ -15,6 +15,7 @@ import pytest
 from samples import made_up
 from vsearch_jax import encoder as encoders
 from vsearch_jax.config import Config, ConfigError
+from vsearch_jax.export import stablehlo
 from vsearch_jax.export.stablehlo import export
 from vsearch_jax.search import sac
 from vsearch_jax.types import Image
@@ -102,4 +103,19 @@ def test_a_policy_that_does_not_exist_is_named(tmp_path: Path) -> None:
     config = make_config("rgb")
     with pytest.raises(ConfigError, match="`policy` is 2; allowed: 0 to 1"):
         export(tmp_path, random_state(config), config, policy=2)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_full_disk_leaves_no_part_of_a_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def fail(descriptor: int) -> None:
+        raise OSError("no space")
+
+    made = SimpleNamespace(serialize=lambda: bytearray(b"x" * 50), platforms=(), in_avals=[], out_avals=[])
+    monkeypatch.setattr(stablehlo, "_export", lambda *_: made)
+    monkeypatch.setattr(stablehlo, "_describe", lambda *_: [])
+    config, pool = make_config("rgb"), SimpleNamespace(qpos=np.zeros((5, 9)), camera=SimpleNamespace(fovy=np.ones(5)))
+    state: Any = SimpleNamespace(encoder=None, sac=SimpleNamespace(actor={}), pool=pool, reach=made_up.reach())
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(OSError, match="no space"):
+        export(tmp_path, state, config)
     assert not any(tmp_path.iterdir())

@@ -10,14 +10,17 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.patches import Rectangle
 from PIL import Image
 from rich.console import Console
 
 from samples import made_up
 from vsearch_jax import report
 from vsearch_jax.config import Config
+from vsearch_jax.report import figures
 from vsearch_jax.report.page import CAPTIONS
 from vsearch_jax.report.table import table_rows
+from vsearch_jax.report.thesis import thesis_range
 from vsearch_jax.runs.loop import Evaluated
 from vsearch_jax.search import LABELS, POLICIES
 
@@ -212,3 +215,28 @@ def test_search_strip_shows_every_step_and_the_target() -> None:
         "step 3: 0.990",
         "target",
     ]
+
+
+def test_a_range_of_the_thesis_is_drawn_from_its_lowest_to_its_highest_value(results: dict[str, Any]) -> None:
+    panels = figures.draw_comparison(results).axes
+    images = next(axes for axes in panels if axes.get_title(loc="left") == "images or steps, mean")
+    bars = {round(bar.get_x() + bar.get_width() / 2, 3): bar for bar in images.patches if isinstance(bar, Rectangle)}
+    num_ranges = 0
+    for position, name in enumerate(LABELS):
+        published = thesis_range(name, "evaluations_mean")
+        if published is None:
+            assert round(position + 0.2, 3) not in bars
+            continue
+        bar, (low, high) = bars[round(position + 0.2, 3)], published
+        num_ranges += low < high
+        wanted = (low, high) if low < high else (0.0, high)
+        assert (bar.get_y(), bar.get_y() + bar.get_height()) == pytest.approx(wanted)
+    assert num_ranges > 0
+
+
+def test_the_last_bar_of_a_histogram_says_what_it_holds() -> None:
+    trials = made_up.trials((1, 400), 5)
+    degrees = np.rad2deg(trials["rotation_error"])
+    drawn = figures.draw_policy_episodes(trials | {"steps_lower_bound": np.full((1, 400), 3)})
+    label = drawn.axes[1].get_xlabel()
+    assert f"above {np.percentile(degrees, 99):.3g}, up to {degrees.max():.3g}" in label

@@ -51,9 +51,9 @@ def parse(arguments: Sequence[str]) -> Command:
             raise UsageError(f"the value of {option} is empty; give a value, or leave the option out")
     if name == "train":
         default = Train(out=tyro.MISSING, config=_starting_config(rest))
-        return _apply_shortcuts(_parse_as(Train, rest, f"vsearch {name}", default))
+        return _expand_home(_apply_shortcuts(_parse_as(Train, rest, f"vsearch {name}", default)))
     if name in COMMANDS:
-        return _parse_as(COMMANDS[name], rest, f"vsearch {name}")
+        return _expand_home(_parse_as(COMMANDS[name], rest, f"vsearch {name}"))
     if name and not name.startswith("-"):
         raise UsageError(f"unknown command {name!r}; allowed: {', '.join(COMMANDS)}")
     # Prints the help or raises, since no subcommand comes first. tyro accepts a union in place of a type.
@@ -92,7 +92,7 @@ def _starting_config(arguments: Sequence[str]) -> Config:
     """Returns the config that the options of `train` change: the preset's, or with --resume the run's."""
     preset, out = _option_value("--preset", arguments), _option_value("--out", arguments)
     if preset is None and out is not None and "--resume" in arguments:
-        return read_config(Path(out))
+        return read_config(Path(os.path.expanduser(out)))
     return Config.preset(preset or DEFAULT_PRESET)
 
 
@@ -105,6 +105,13 @@ def _option_value(option: str, arguments: Sequence[str]) -> str | None:
         elif argument.startswith(f"{option}="):
             value = argument.partition("=")[2]
     return value
+
+
+def _expand_home(command: Command) -> Command:
+    """Returns the command with `~` at the start of its paths replaced. Shells leave it in `--out=~/run`."""
+    values = {field.name: getattr(command, field.name) for field in dataclasses.fields(command)}
+    paths = {name: value for name, value in values.items() if isinstance(value, Path)}
+    return dataclasses.replace(command, **{name: Path(os.path.expanduser(path)) for name, path in paths.items()})
 
 
 def _apply_shortcuts(command: Train) -> Train:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from vsearch_jax.cli.output import OutputError
 from vsearch_jax.config import Config
 from vsearch_jax.runs.metrics_log import MetricsLine
 
@@ -34,6 +35,8 @@ class TrainingProgress:
         """
         self.bar, self.console, self.config = bar, console, config
         self._task = bar.add_task("compiling", total=config.num_iterations, completed=step)
+        if not console.is_terminal:
+            console.print("compiling the training", highlight=False)
 
     def update(self, step: int, seconds: float, lines: Sequence[MetricsLine]) -> None:
         """Shows that a chunk of iterations is done: moves the bar, or prints a line without a terminal.
@@ -51,7 +54,22 @@ class TrainingProgress:
     def announce_stop(self) -> None:
         """Shows that the training stops after the chunk of iterations that is running."""
         self.bar.update(self._task, description="stopping after this chunk")
-        self.console.print("stopping after this chunk; interrupt again to stop now, without saving it", highlight=False)
+        with contextlib.suppress(OutputError):  # The chunk must be saved, also if Ctrl-C has ended the reader.
+            text = "stopping after this chunk; interrupt again to stop now, without saving it"
+            self.console.print(text, highlight=False)
+
+
+def show_status(console: Console, text: str) -> contextlib.AbstractContextManager[object]:
+    """Shows what is done while a `with` block runs: with a spinner on a terminal, else as a line.
+
+    Args:
+      console: the rich console to print on.
+      text: what is done.
+    """
+    if console.is_terminal:
+        return console.status(text)
+    console.print(text, highlight=False)
+    return contextlib.nullcontext()
 
 
 @contextlib.contextmanager

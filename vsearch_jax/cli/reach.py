@@ -10,7 +10,9 @@ import numpy as np
 
 from vsearch_jax import report
 from vsearch_jax.config import Config, ConfigError, SceneConfig
+from vsearch_jax.env import build_parts
 from vsearch_jax.planning.mount_scan import Mount, best_mount, scan_mounts
+from vsearch_jax.runs.atomic import write_atomically
 
 NUM_AZIMUTHS = 24
 """Azimuths of a reachability map. Between them, what an arm reaches changes little."""
@@ -38,23 +40,30 @@ def draw_reach(
     Raises:
       ConfigError: `heights` or `band_deg` is no range, or no height reaches a view of the band. In the last case the
         figures are drawn.
-      SceneError: arm or object cannot be loaded.
+      SceneError, RenderError: the scene cannot be built, drawn or planned in; see `env.build_parts`.
+      OSError: the disk is full or not writable.
     """
     _check_ranges(band_deg, heights)
     low, high, step = heights
     ik = dataclasses.replace(Config().ik, map_azimuths=NUM_AZIMUTHS)
-    tried = np.arange(int((high - low) / step + 1e-6) + 1) * step + low
-    mounts = scan_mounts(dataclasses.replace(Config(), scene=scene, ik=ik), tried.tolist(), band_deg)
+    config = dataclasses.replace(Config(), scene=scene, ik=ik)
+    build_parts(config)  # refuses what `train` refuses
+    # Rounded: a sum of steps such as 0.8 + 11 * 0.05 is 1.35 plus a rounding error.
+    tried = np.round(np.arange(int((high - low) / step + 1e-6) + 1) * step + low, 9)
+    mounts = scan_mounts(config, tried.tolist(), band_deg)
     best = best_mount(mounts)
-    report.draw_reachability(best.reach, band_deg).savefig(out / "reachability.png")
     coverages = [mount.coverage for mount in mounts]
-    curve = report.draw_mount_heights([mount.height for mount in mounts], coverages, best.height)
-    curve.savefig(out / "mount_heights.png")
+    figures = {
+        "reachability.png": report.draw_reachability(best.reach, band_deg),
+        "mount_heights.png": report.draw_mount_heights([mount.height for mount in mounts], coverages, best.height),
+    }
+    for name, figure in figures.items():
+        write_atomically(out / name, report.to_png(figure))
     views = f"views from {band_deg[0]:g} to {band_deg[1]:g} degrees of elevation"
     if best.coverage == 0.0:
         raise ConfigError(
             f"arm {scene.arm!r} reaches none of the {views} around object {scene.object!r} at any mount height from "
-            f"{low:g} to {high:g} m; {out / 'reachability.png'} shows what it reaches"
+            f"{low:.10g} to {high:.10g} m; {out / 'reachability.png'} shows what it reaches"
         )
     is_at_end = best.coverage < 1.0 and len(mounts) > 1 and best.height in (mounts[0].height, mounts[-1].height)
     return _describe(best, views, is_at_end, out)
@@ -83,7 +92,7 @@ def _describe(best: Mount, views: str, is_at_end: bool, out: Path) -> str:
     elevations = "no elevation" if np.isnan(band).any() else f"elevations from {band[0]:.0f} to {band[1]:.0f} degrees"
     beyond = ", at the end of the heights tried: a wider range may give a better one" if is_at_end else ""
     return (
-        f"mount height {best.height:.3g} m{beyond}: the arm reaches {100 * best.coverage:.1f} % of the {views}, and "
+        f"mount height {best.height:.10g} m{beyond}: the arm reaches {100 * best.coverage:.1f} % of the {views}, and "
         f"{elevations} at every azimuth, which is the band that `vsearch train` searches; see "
         f"{out / 'reachability.png'}"
     )

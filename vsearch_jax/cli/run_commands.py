@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
+import os
 from pathlib import Path
 
 from rich.console import Console
@@ -10,14 +13,14 @@ from rich.console import Console
 from vsearch_jax import film, report
 from vsearch_jax.cli.commands import Eval, Export, Reach, Train, Video
 from vsearch_jax.cli.parse import absolute_path
-from vsearch_jax.cli.progress import training_progress
+from vsearch_jax.cli.progress import show_status, training_progress
 from vsearch_jax.cli.reach import draw_reach
 from vsearch_jax.config import Config, ConfigError, SceneConfig
-from vsearch_jax.env import UnreachableError
+from vsearch_jax.env import UnreachableError, check_jax_settings
 from vsearch_jax.export import stablehlo
 from vsearch_jax.runs import loop
 from vsearch_jax.runs.atomic import write_atomically
-from vsearch_jax.runs.folder import RunError, check_new_file, lock_folder, make_new_folder, read_config, read_seed
+from vsearch_jax.runs.folder import RunError, lock_folder, new_file, new_folder, read_config, read_seed
 from vsearch_jax.scene import build_scene, describe_symmetry
 from vsearch_jax.types import TrainState
 
@@ -30,6 +33,7 @@ def run_command(command: Train | Eval | Export | Reach | Video) -> None:
       OSError: the disk is full or not writable.
       KeyboardInterrupt: a signal stopped the command.
     """
+    check_jax_settings()
     match command:
         case Train():
             _train(command)
@@ -45,10 +49,9 @@ def run_command(command: Train | Eval | Export | Reach | Video) -> None:
 
 def _train(command: Train) -> None:
     console, config, run = Console(), command.config, command.out
-    if not command.resume:
-        make_new_folder(run)
-    with lock_folder(run):
-        with console.status("building the scene, computing what the arm reaches"):
+    made = contextlib.nullcontext() if command.resume else new_folder(run)
+    with made, lock_folder(run):
+        with show_status(console, "building the scene, computing what the arm reaches"):
             state = _resume(command) if command.resume else _start(command)
         if sentence := describe_symmetry(build_scene(config.scene).symmetry):
             console.print(sentence, highlight=False, soft_wrap=True)
@@ -62,12 +65,18 @@ def _start(command: Train) -> TrainState:
     try:
         return loop.start_run(command.out, command.config, command.seed or 0)
     except UnreachableError as error:
-        figure = command.out.with_name(f"{command.out.name}-reachability.png")
+        figure = _unused_path(f"{os.path.abspath(command.out)}-reachability")
         try:
             write_atomically(figure, report.to_png(report.draw_reachability(error.reach)))
         except OSError:  # A full disk matters less to the user than the error in the config.
             raise error from None
         raise ConfigError(f"{error}; {figure} shows what it reaches") from None
+
+
+def _unused_path(stem: str) -> Path:
+    """Returns the path of a PNG file that does not exist yet: the stem, with a number if the stem alone is in use."""
+    names = itertools.chain([f"{stem}.png"], (f"{stem}-{number}.png" for number in itertools.count(2)))
+    return next(Path(name) for name in names if not os.path.lexists(name))
 
 
 def _resume(command: Train) -> TrainState:
@@ -88,11 +97,10 @@ def _evaluate_again(command: Eval) -> None:
             f"{trained.env.motion}; name a folder for the results of another evaluation with --out"
         )
     with lock_folder(command.run):
-        with console.status("reading the run"):
+        with show_status(console, "reading the run"):
             state = _finished_state(command.run, trained)
-        if command.out is not None:
-            make_new_folder(command.out)
-        _evaluate(command.run, state, config, console, out=command.out or command.run)
+        with contextlib.nullcontext() if command.out is None else new_folder(command.out):
+            _evaluate(command.run, state, config, console, out=command.out or command.run)
 
 
 def _with_motion(command: Eval, config: Config) -> Config:
@@ -104,12 +112,13 @@ def _with_motion(command: Eval, config: Config) -> Config:
 
 def _evaluate(run: Path, state: TrainState, config: Config, console: Console, *, out: Path) -> None:
     """Evaluates a run, writes its report into `out` and prints the table."""
-    with console.status("evaluating every searcher"):
+    with show_status(console, "evaluating every searcher"):
         summary = report.write_report(out, loop.evaluate_run(run, state, config), config)
     report.print_table(summary, console)
     if sentence := describe_symmetry(summary["symmetry"]):
         console.print(sentence, highlight=False, soft_wrap=True)
-    console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True)
+    # A path may hold brackets or colons, which rich would take for markup or emoji.
+    console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True, markup=False, emoji=False)
     if (warning := report.false_positive_warning(summary)) is not None:
         console.print(warning, style="bold red", highlight=False, soft_wrap=True)
 
@@ -124,8 +133,8 @@ def _finished_state(run: Path, config: Config) -> TrainState:
 def _export(command: Export) -> None:
     config = read_config(command.run)
     state = _finished_state(command.run, config)
-    make_new_folder(command.out)
-    stablehlo.export(command.out, state, config, command.policy)
+    with new_folder(command.out):
+        stablehlo.export(command.out, state, config, command.policy)
     print(f"wrote {command.out}: encoder.stablehlo, policy.stablehlo, interface.json")
 
 
@@ -139,8 +148,7 @@ def _reach(command: Reach) -> None:
         mesh_scale=command.mesh_scale,
         mesh_up=command.mesh_up,
     )
-    make_new_folder(command.out)
-    with Console().status("computing what the arm reaches"):
+    with new_folder(command.out), show_status(Console(), "computing what the arm reaches"):
         message = draw_reach(command.out, scene, command.band, command.heights)
     print(message)
 
@@ -148,7 +156,6 @@ def _reach(command: Reach) -> None:
 def _film(command: Video) -> None:
     config = read_config(command.run)
     state = _finished_state(command.run, config)
-    check_new_file(command.out, ".mp4")
-    with Console().status("filming a search"):
+    with new_file(command.out, ".mp4"), show_status(Console(), "filming a search"):
         message = film.make_film(command.out, state, config, command.motion, command.episode)
     print(message)

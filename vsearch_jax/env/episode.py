@@ -150,6 +150,12 @@ def next_state(state: State, observation: Observation, motion: Motion, config: E
     )
 
 
+def rest_state(state: State) -> State:
+    """Returns the brax State of an episode that is over after one more step: the step earns and costs nothing."""
+    nothing = {name: jnp.zeros_like(state.metrics[name]) for name in ("unreachable", "joint_travel", "motion_time")}
+    return dataclasses.replace(state, reward=jnp.zeros_like(state.reward), metrics=state.metrics | nothing)
+
+
 def step_reward(similarity: Array, is_reachable: Array, config: EnvConfig) -> tuple[Array, Array]:
     """Computes the reward of a step, and whether the step finds the target. The arrays may have leading batch axes.
 

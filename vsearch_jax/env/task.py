@@ -16,11 +16,10 @@ from vsearch_jax.config import Config
 from vsearch_jax.env import episode as episodes
 from vsearch_jax.env import motion as motions
 from vsearch_jax.env.episode import check_band, episode_of
+from vsearch_jax.env.parts import build_parts
 from vsearch_jax.geometry import view_from_uniform
 from vsearch_jax.planning import Motion, Trajectory, nearest_cell, reachability_map, solve_view
-from vsearch_jax.planning.execution import check_drive
-from vsearch_jax.robot.arm import build_arm, camera_pose, forward_kinematics
-from vsearch_jax.scene import SceneError, build_scene
+from vsearch_jax.robot.arm import camera_pose, forward_kinematics
 from vsearch_jax.types import Camera, EncoderState, Image, Observation, ReachabilityMap, View
 from vsearch_jax.xla.tree import tree_where
 
@@ -53,22 +52,12 @@ class ViewSearchEnv(Env):
           reach: ReachabilityMap of the arm; computed by default.
 
         Raises:
-          SceneError: arm or object cannot be loaded, or no geom of the object is visible.
-          PlanningError: `config.env.motion` is "dynamic" and a joint has no speed limit.
+          ConfigError, SceneError, RenderError, PlanningError: as `build_parts`.
           UnreachableError: there is no elevation that the arm reaches at every azimuth. Not checked while JAX traces.
         """
         self.config = config if config is not None else Config.preset("cpu")
-        self.scene = build_scene(self.config.scene)
+        self.scene, self.arm, self.render_scene = build_parts(self.config)
         self.center = jnp.asarray(self.scene.center, jnp.float32)
-        self.arm = build_arm(self.scene)
-        if self.config.env.motion == "dynamic":
-            check_drive(self.scene, self.arm)
-        self.render_scene = render.compile_scene(self.scene.mj_model)
-        if not set(self.scene.object_geom_ids) & set(self.render_scene.geom_ids):
-            raise SceneError(
-                f"object {self.config.scene.object!r} has no visible geom in the groups 0 to 2; the renderer draws "
-                "only these groups, so put a geom of the object into one of them"
-            )
         self.fovy = math.radians(float(self.scene.mj_model.cam_fovy[self.scene.camera_id]))
         self.encoder = encoder if encoder is not None else encoders.init(jax.random.key(0), self.config)
         self.reach = reach if reach is not None else jax.jit(self.compute_reachability)(jax.random.key(_REACH_SEED))
@@ -111,17 +100,21 @@ class ViewSearchEnv(Env):
         return episodes.start_state(observation, target)
 
     def step(self, state: State, action: Array) -> State:
-        """Moves the camera by an action, and returns the brax State after it. If `done` is set, nothing changes.
+        """Moves the camera by an action, and returns the brax State after it.
+
+        If `done` is set, the episode is over: the arm stays, and the reward is 0.
 
         Args:
           state: brax State before the action.
-          action: f32[2], change of azimuth and elevation in units of `env.action_scale_deg`; clipped to [-1, 1].
+          action: f32[2], change of azimuth and elevation in units of `env.action_scale_deg`; clipped to [-1, 1]. A
+            view of NaN is unreachable, so an action of NaN earns `unreachable_reward`, and the arm stays.
         """
         is_over = state.done > 0.0
         observation, motion = self.move_to_view(
             self.commanded_view(state, action), episode_of(state).observation.qpos, is_over
         )
-        return tree_where(is_over, state, self.apply_transition(state, observation, motion))
+        next_state = self.apply_transition(state, observation, motion)
+        return tree_where(is_over, episodes.rest_state(state), next_state)
 
     def commanded_view(self, state: State, action: Array) -> View:
         """Returns the view that an action asks for: the present view plus the action's change. It may be unreachable.

@@ -17,6 +17,7 @@ from vsearch_jax.config import Config
 from vsearch_jax.env import ViewSearchEnv, episode_of
 from vsearch_jax.evaluation.outcome import Outcome, measure_outcome
 from vsearch_jax.evaluation.step_bound import steps_lower_bound
+from vsearch_jax.evaluation.views import SeenView
 from vsearch_jax.search import POLICIES, SearchArgs, sac
 from vsearch_jax.search.common import is_running
 from vsearch_jax.search.sac import assisted, policy
@@ -78,7 +79,7 @@ class _Bench(NamedTuple):
 
 
 def evaluate_policies(
-    env: ViewSearchEnv, state: TrainState, episodes: tuple[Array, Observation], grid: Observation
+    env: ViewSearchEnv, state: TrainState, episodes: tuple[Array, Observation], grid: SeenView
 ) -> dict[str, Outcome]:
     """Runs each of the S trained policies in its E evaluation episodes, and measures how each search ended.
 
@@ -176,7 +177,7 @@ def _measure(env: ViewSearchEnv, episode: _Episode, loop: _Loop) -> tuple[Outcom
     return outcome, help_.num_stalled
 
 
-def _lower_bound(env: ViewSearchEnv, grid: Observation, ends: Observation) -> Array:
+def _lower_bound(env: ViewSearchEnv, grid: SeenView, ends: Observation) -> Array:
     """Returns the lower bound i32[] on the steps of an episode; `ends` is of its initial view and its target view."""
     initial, target = (jax.tree.map(lambda x, i=i: x[i], ends) for i in range(2))
     return steps_lower_bound(initial.view, target, grid, env.reach.band, env.config)

@@ -17,7 +17,7 @@ from vsearch_jax.evaluation.episodes import episode_keys, evaluate_policies
 from vsearch_jax.evaluation.outcome import Outcome
 from vsearch_jax.evaluation.step_bound import band_grid
 from vsearch_jax.evaluation.trials import search_trials
-from vsearch_jax.evaluation.views import ViewRequest, initial_views, observe_request
+from vsearch_jax.evaluation.views import SeenView, ViewRequest, initial_views, observe_request
 from vsearch_jax.search import BLACK_BOX
 from vsearch_jax.types import Observation, ReachabilityMap, TrainState
 from vsearch_jax.xla.batching import map_in_batches
@@ -59,10 +59,36 @@ def evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
       - `num_helped` i32 of `sac_assisted`: steps that the local search chose.
 
     Raises:
-      ConfigError: the arm cannot reach the target view, or reaches no elevation at every azimuth.
+      UnreachableError: the arm cannot reach the target view, or reaches no elevation at every azimuth.
     """
     check_target(state.reach, config)
-    return _evaluate(state, config)
+    outcomes, is_target_reached = _evaluate(state, config)
+    settings = config.evaluation
+    check_reached(is_target_reached, (settings.target_azimuth_deg, settings.target_elevation_deg), state.reach)
+    return outcomes
+
+
+def check_reached(is_reached: Array, target_deg: tuple[float, float], reach: ReachabilityMap) -> None:
+    """Checks that inverse kinematics brought the camera to the target view.
+
+    Inside the band it rarely fails: between the views of the reachability map. Does nothing while JAX traces, because
+    values are unknown then.
+
+    Args:
+      is_reached: bool[], the camera was at the target view.
+      target_deg: azimuth and elevation of the target view in degrees, for the error message.
+      reach: the views that the arm reaches.
+
+    Raises:
+      UnreachableError: the camera was not at the target view.
+    """
+    if not isinstance(is_reached, Tracer) and not bool(is_reached):
+        raise UnreachableError(
+            f"inverse kinematics finds no joints for the target view at EvaluationConfig.target_azimuth_deg "
+            f"{target_deg[0]:g} and EvaluationConfig.target_elevation_deg {target_deg[1]:g}, although the arm reaches "
+            "views around it; evaluate with another target, for example one degree away",
+            reach,
+        )
 
 
 def check_target(reach: ReachabilityMap, config: Config) -> None:
@@ -93,7 +119,8 @@ def check_target(reach: ReachabilityMap, config: Config) -> None:
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
+def _evaluate(state: TrainState, config: Config) -> tuple[dict[str, Outcome], Array]:
+    """Returns the measures of all searchers; and bool[], whether the camera was at the target view."""
     env = ViewSearchEnv(config, state.encoder, state.reach)
     key = jax.random.fold_in(state.key, 2**31 - 1)  # a salt that training does not use
     known_views_key, search_key, policy_key = jax.random.split(key, 3)
@@ -101,24 +128,24 @@ def _evaluate(state: TrainState, config: Config) -> dict[str, Outcome]:
     reset_keys, search_keys = episode_keys(policy_key, config)
     initial, grid, target, ends = observe_known_views(known_views_key, reset_keys, env, config)
     methods = tuple(build(config) for build in BLACK_BOX.values())
-    trials = search_trials(jax.random.split(search_key, len(methods)), env, methods, initial, target)
+    trials = search_trials(jax.random.split(search_key, len(methods)), env, methods, initial, target.observation)
     outcomes = dict(zip(BLACK_BOX, trials, strict=True))
-    return outcomes | evaluate_policies(env, state, (search_keys, ends), grid)
+    return outcomes | evaluate_policies(env, state, (search_keys, ends), grid), target.is_reached
 
 
 class KnownViews(NamedTuple):
     """What the camera sees from the views that are known before the searches start.
 
     Attributes:
-      initial: Observation of f32[N, ...], from the initial views of the N trials (searches).
-      grid: Observation of f32[P, ...], from the P views of `band_grid`.
-      target: Observation from the target view of random search and CMA-ES.
+      initial: from the initial views of the N trials (searches), arrays [N, ...].
+      grid: from the P views of `band_grid`, arrays [P, ...].
+      target: from the target view of random search and CMA-ES.
       ends: Observation from initial and target views of the policies' episodes; the axes of the reset keys lead.
     """
 
-    initial: Observation
-    grid: Observation
-    target: Observation
+    initial: SeenView
+    grid: SeenView
+    target: SeenView
     ends: Observation
 
 
@@ -145,13 +172,14 @@ def observe_known_views(key: Array, reset_keys: Array, env: ViewSearchEnv, confi
         ViewRequest(*jax.vmap(env.random_view)(reset_keys.reshape(-1)), jnp.zeros(reset_keys.size, bool)),
     )
     requests = jax.tree.map(lambda *x: jnp.concatenate(x), *requests)
-    observations = map_in_batches(functools.partial(observe_request, env), requests, config.evaluation.batch_size)
+    seen = map_in_batches(functools.partial(observe_request, env), requests, config.evaluation.batch_size)
     num_trials, num_fixed = views.azimuth.shape[0], keys.shape[0]
     parts = (slice(num_trials), slice(num_trials, num_fixed - 1), num_fixed - 1, slice(num_fixed, None))
-    known = KnownViews(*(jax.tree.map(lambda x, part=part: x[part], observations) for part in parts))
-    ends = jax.tree.map(lambda x: x.reshape(*reset_keys.shape, *x.shape[1:]), known.ends)
+    known = [jax.tree.map(lambda x, part=part: x[part], seen) for part in parts]
+    initial, grid, target = known[:3]
+    ends = jax.tree.map(lambda x: x.reshape(*reset_keys.shape, *x.shape[1:]), known[3].observation)
     if config.env.target == "fixed":
         ends = jax.tree.map(
-            lambda x, target: x.at[..., 1, *[slice(None)] * target.ndim].set(target), ends, known.target
+            lambda x, target: x.at[..., 1, *[slice(None)] * target.ndim].set(target), ends, target.observation
         )
-    return known._replace(ends=ends)
+    return KnownViews(initial, grid, target, ends)

@@ -80,13 +80,14 @@ def opposite_start(env: ViewSearchEnv, key: Array) -> ViewRequest:
       key: PRNG key of the run (`TrainState.key`). IK starts from random joint values drawn from it.
 
     Returns:
-      Two ViewRequests (leading axis 2), the initial view first. Neither view may be replaced by a nearby one.
+      Two ViewRequests (leading axis 2), the initial view first. The nearest reachable view of the map replaces a view
+      that the arm cannot reach.
     """
     target = protocol_target(env.config)
     initial = View(wrap_angle(target.azimuth + math.radians(165.0)), jnp.mean(env.reach.band))
     views = jax.tree.map(lambda *x: jnp.stack(x), initial, target)
     keys = jax.random.split(jax.random.fold_in(key, 2**31 - 2))  # a salt that training does not use
-    return ViewRequest(views, jax.vmap(env.random_joints)(keys), jnp.ones(2, bool))
+    return ViewRequest(views, jax.vmap(env.random_joints)(keys), jnp.zeros(2, bool))
 
 
 def start_episode(env: ViewSearchEnv, ends: ViewRequest) -> State:
@@ -94,12 +95,12 @@ def start_episode(env: ViewSearchEnv, ends: ViewRequest) -> State:
 
     Args:
       env: the task.
-      ends: the requested views, leading axis 2: initial view, target view.
+      ends: the requested views, leading axis 2: initial view, target view. A reachable view may replace each of them.
 
     Returns:
       brax State at the start of the episode.
     """
-    observations = jax.lax.map(functools.partial(observe_request, env), ends)
+    observations = jax.lax.map(functools.partial(observe_request, env), ends).observation
     return env.start(*(jax.tree.map(lambda x, i=i: x[i], observations) for i in range(2)))
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.config import Config
+from vsearch_jax.evaluation.views import SeenView
 from vsearch_jax.geometry import angle_difference, cosine_similarity
 from vsearch_jax.types import Observation, View
 
@@ -29,7 +30,7 @@ def band_grid(band: Array) -> View:
     return View(*(x.reshape(-1) for x in jnp.meshgrid(azimuths, elevations)))
 
 
-def steps_lower_bound(initial: View, target: Observation, grid: Observation, band: Array, config: Config) -> Array:
+def steps_lower_bound(initial: View, target: Observation, grid: SeenView, band: Array, config: Config) -> Array:
     """Estimates a lower bound on the number of steps that any policy needs in one episode.
 
     A step changes azimuth and elevation by at most `action_scale_deg` each. The episode ends at any view whose code
@@ -42,7 +43,7 @@ def steps_lower_bound(initial: View, target: Observation, grid: Observation, ban
     Args:
       initial: initial view of the episode, f32[] rad.
       target: what the camera sees from the target view.
-      grid: what the camera sees from the N views of `band_grid`: an Observation of f32[N, ...].
+      grid: what the camera sees from the N views of `band_grid`: arrays [N, ...].
       band: f32[2] rad, lowest and highest elevation of the grid.
       config: `env.threshold` and `env.action_scale_deg` are read.
 
@@ -57,7 +58,7 @@ def steps_lower_bound(initial: View, target: Observation, grid: Observation, ban
         azimuth = jnp.abs(angle_difference(view.azimuth, initial.azimuth)) - azimuth_spacing
         return jnp.maximum(azimuth, jnp.abs(view.elevation - initial.elevation) - elevation_spacing)
 
-    is_found = cosine_similarity(grid.code, target.code[None]) >= config.env.threshold
-    to_grid = jnp.where(is_found, angle_to(grid.view), jnp.inf).min()
+    is_found = cosine_similarity(grid.observation.code, target.code[None]) >= config.env.threshold
+    to_grid = jnp.where(is_found & grid.is_reached, angle_to(grid.observation.view), jnp.inf).min()
     steps = jnp.minimum(to_grid, angle_to(target.view)) / math.radians(config.env.action_scale_deg)
     return jnp.maximum(jnp.ceil(steps - 1e-5), 1.0).astype(jnp.int32)

@@ -11,6 +11,7 @@ from jax import Array
 
 from vsearch_jax.env import ViewSearchEnv
 from vsearch_jax.evaluation.outcome import Outcome, measure_outcome
+from vsearch_jax.evaluation.views import SeenView
 from vsearch_jax.geometry import cosine_similarity
 from vsearch_jax.planning import Motion
 from vsearch_jax.search import Method, SearchArgs
@@ -74,7 +75,7 @@ class _Trial(NamedTuple):
 
 
 def search_trials(
-    keys: Array, env: ViewSearchEnv, methods: tuple[Method, ...], initial: Observation, target: Observation
+    keys: Array, env: ViewSearchEnv, methods: tuple[Method, ...], initial: SeenView, target: Observation
 ) -> list[Outcome]:
     """Runs all trials of the black-box searchers, one search by every searcher from each of N initial views.
 
@@ -85,16 +86,16 @@ def search_trials(
       keys: PRNG keys [len(methods)], one for each searcher.
       env: the task.
       methods: the searchers, each in parts (start, ask, tell, record).
-      initial: what the camera sees from the N initial views, Observation of f32[N, ...]. The code of a view that the
-        arm cannot reach is all zeros.
+      initial: what the camera sees from the N initial views: arrays [N, ...]. The score of a view that the arm does not
+        reach is -inf.
       target: what the camera sees from the target view.
 
     Returns:
       Measures of the N trials, for each searcher in the order of `methods`; `evaluate` describes them.
     """
-    bench, shape = _Bench(env, methods, target), (len(methods), initial.code.shape[0])
-    similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(initial.code, target.code)
-    starts = (initial, jnp.where(jnp.any(initial.code != 0.0, axis=-1), similarity, -jnp.inf))
+    bench, shape = _Bench(env, methods, target), (len(methods), initial.is_reached.shape[0])
+    similarity = jax.vmap(cosine_similarity, in_axes=(0, None))(initial.observation.code, target.code)
+    starts = (initial.observation, jnp.where(initial.is_reached, similarity, -jnp.inf))
     trial_keys = jax.vmap(functools.partial(jax.random.split, num=shape[1]))(keys)
     numbers = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
     all_starts = jax.tree.map(lambda x: jnp.broadcast_to(x, (shape[0], *x.shape)), starts)
@@ -123,7 +124,7 @@ def search_trials(
         result = jax.vmap(to_result)(method.record(states))
         # The image of the initial view needs no motion.
         motions = {"joint_travel": costs[:, 0], "motion_time": costs[:, 1], "num_plans": result.evaluations - 1}
-        views: Outcome = {"initial_view": initial.view}
+        views: Outcome = {"initial_view": initial.observation.view}
         outcomes.append(measure(result, best, target) | jax.vmap(method.counts)(states) | motions | views)
     return outcomes
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -46,17 +45,24 @@ class ViewRequest(NamedTuple):
     is_fixed: Array
 
 
-def observe_request(env: ViewSearchEnv, request: ViewRequest) -> Observation:
+class SeenView(NamedTuple):
+    """What the wrist camera sees after a request. Arrays may have leading batch axes.
+
+    Attributes:
+      observation: what the camera sees. If the view is not reached, the joints in it have no meaning.
+      is_reached: bool[], the arm reaches the view. False only if no other view may replace an unreachable one.
+    """
+
+    observation: Observation
+    is_reached: Array
+
+
+def observe_request(env: ViewSearchEnv, request: ViewRequest) -> SeenView:
     """Brings the camera to the requested view, and returns what it sees there.
 
     Args:
       env: the task.
       request: the view, preferred joint values, and whether a reachable view may replace an unreachable one.
-
-    Returns:
-      What the camera sees. If the arm cannot reach the view and no other view may replace it, the image code is all
-      zeros, so its cosine with any code is 0.
     """
     view, qpos, is_reached = env.resolve_view(*request)
-    observation = env.observe_view(view, qpos)
-    return dataclasses.replace(observation, code=jnp.where(is_reached, observation.code, 0.0))
+    return SeenView(env.observe_view(view, qpos), is_reached)

@@ -18,6 +18,7 @@ from jax.core import ShapedArray
 from vsearch_jax import encoder as encoders
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.geometry import cosine_similarity
+from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.search import sac
 from vsearch_jax.types import EncoderState, Image, TrainState
 
@@ -109,9 +110,9 @@ def export(folder: Path, state: TrainState, config: Config, policy: int = 0) -> 
     }
     folder.mkdir(parents=True, exist_ok=True)
     for name, function in exported.items():
-        (folder / f"{name}.stablehlo").write_bytes(function.serialize())
+        write_atomically(folder / f"{name}.stablehlo", bytes(function.serialize()))
     interface = json.dumps(_interface(exported, state, config), indent=2) + "\n"
-    (folder / "interface.json").write_text(interface, encoding="utf-8")
+    write_atomically(folder / "interface.json", interface)
 
 
 def _arguments(config: Config, num_joints: int) -> tuple[jax.ShapeDtypeStruct, ...]:

@@ -54,7 +54,8 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int, size: tuple[i
     options = f"-y -loglevel error {raw} {encoded}".split()
     with replace_file(path) as temporary:
         # Not imageio's writer: it forks, which can deadlock beside JAX's threads, and it hides the encoder's errors.
-        command = [find_ffmpeg(), *options, str(temporary)]
+        # An absolute path, because ffmpeg takes `a:b.mp4` for a protocol and `-a.mp4` for an option.
+        command = [find_ffmpeg(), *options, str(temporary.absolute())]
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe) as encoder:
             try:

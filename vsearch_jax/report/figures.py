@@ -88,7 +88,7 @@ def draw_mount_heights(heights: Sequence[float], coverages: Sequence[float], bes
     axes.plot(heights, 100.0 * np.asarray(coverages), marker="o", markersize=3)
     axes.axvline(best, linestyle=":", color="black")
     axes.set(xlabel="mount height (m)", ylabel="reachable wanted views (%)", ylim=(-3, 103))
-    axes.set_title(f"Best mount height: {best:.2f} m")
+    axes.set_title(f"Best mount height: {best:.10g} m")
     return figure
 
 
@@ -198,13 +198,14 @@ def _thesis_mean(key: str) -> float:
 
 
 def _plot_errors(axes: Axes, errors: np.ndarray, label: str, unit: str, thesis_mean: float) -> None:
-    """Plots a histogram of errors, their median and the thesis's mean."""
-    shown = np.clip(errors, 0, np.percentile(errors, 99))  # the last bar holds the largest errors too
+    """Plots a histogram of errors, their median and the thesis's mean. The last bar also holds the largest errors."""
+    limit = np.percentile(errors, 99)
+    shown = np.clip(errors, 0, limit)
     axes.hist(shown, 30, color=COLORS["sac"], weights=np.full(errors.size, 100.0 / errors.size))
     median = np.median(errors)
     axes.axvline(float(median), color=INK, linewidth=1.2, label=f"median {median:.2f}{unit}")
     axes.axvline(thesis_mean, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis_mean:g}{unit}")
-    axes.set(xlabel=f"{label}\nlast bar: all larger errors", ylabel="episodes (%)")
+    axes.set(xlabel=f"{label}\nlast bar: also those above {limit:.3g}, up to {errors.max():.3g}", ylabel="episodes (%)")
     _legend_above(axes)
 
 
@@ -238,14 +239,17 @@ def draw_comparison(results: Results) -> Figure:
             if of_thesis is None:
                 continue
             low, high = (scale * value for value in of_thesis)
-            middle = 0.5 * (low + high)
-            axes.bar(position + 0.2, middle, 0.38, color=THESIS_COLOR, alpha=0.5, hatch="///", edgecolor="white")
-            if low < high:
-                _plot_interval(axes, position + 0.2, np.array([low, high]))
+            # A range is a bar from its lowest to its highest value: the thesis gives no value between them.
+            bottom = low if low < high else 0.0
+            axes.bar(
+                position + 0.2, high - bottom, 0.38, bottom, color=THESIS_COLOR, alpha=0.5, hatch="///", edgecolor="w"
+            )
         axes.set_xticks(range(len(LABELS)), LABELS.values(), rotation=40, ha="right")
         axes.set_title(label, fontsize=10)
         axes.grid(axis="x", visible=False)
-    figure.supxlabel("coloured: ours with 95 % intervals; hatched: thesis, with its range if it gives one", fontsize=9)
+    figure.supxlabel(
+        "coloured: ours with 95 % intervals; hatched: thesis; a range is a bar that does not start at 0", fontsize=9
+    )
     return figure
 
 

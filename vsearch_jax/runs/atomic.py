@@ -31,7 +31,8 @@ def replace_file(path: Path) -> Iterator[Path]:
     Yields:
       An empty temporary file in the same folder, with the same suffix. The block writes into it.
     """
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    # The stem is cut, because names may have 255 bytes only.
+    temporary = path.with_name(f".{path.stem[:50]}.tmp{path.suffix}")
     try:
         with temporary.open("wb") as file:
             yield temporary

@@ -7,28 +7,22 @@ of nnx, optax and brax. A typed PRNG key is stored as its data. The name of its 
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import json
-import logging
-import sys
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NotRequired, Protocol, TypeAlias, TypedDict, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
-import tensorstore
 
 from vsearch_jax.config import Config
-from vsearch_jax.runs.folder import CHECKPOINTS, resume_command
+from vsearch_jax.runs import orbax_store
+from vsearch_jax.runs.folder import CHECKPOINTS
 from vsearch_jax.runs.old_versions import UNVERSIONED, current_names, with_later_fields
-
-NUM_KEPT = 2
-"""Number of checkpoints kept in a run's folder: the last one and the one before."""
+from vsearch_jax.runs.orbax_store import CheckpointError
 
 _ABSENT = "absent"
 _UNTRAINED_SECTIONS = ("random_search", "cma_es", "evaluation", "num_chunks")
@@ -52,6 +46,7 @@ class _About(TypedDict):
 
     Attributes:
       version: version of vsearch_jax that wrote the checkpoint; missing in checkpoints of version 0.1.0.
+      orbax: version of orbax-checkpoint; missing in checkpoints of versions before 0.3.0.
       config: `Config.to_dict` of the run.
       keys: for each typed PRNG key the name of its implementation.
       arrays: for each array its shape and dtype.
@@ -59,14 +54,11 @@ class _About(TypedDict):
     """
 
     version: NotRequired[str]
+    orbax: NotRequired[str]
     config: dict[str, object]
     keys: dict[str, str]
     arrays: dict[str, Described]
     checksums: NotRequired[dict[str, int]]
-
-
-class CheckpointError(ValueError):
-    """A checkpoint is missing, damaged, or belongs to another config or version. The message names the remedy."""
 
 
 def save(run: Path, state: _HasStep, config: Config) -> None:
@@ -78,35 +70,27 @@ def save(run: Path, state: _HasStep, config: Config) -> None:
       config: the run's config, stored beside the arrays.
 
     Raises:
-      CheckpointError: the folder holds a checkpoint of this step or of a later one.
+      CheckpointError: the folder holds a checkpoint of this step or of a later one, or orbax cannot write it.
       OSError: the disk is full or not writable.
     """
     leaves = _named_leaves(state)
     stored = {name: np.asarray(_data(leaf)) for name, leaf in leaves.items()}
     about: _About = {
         "version": _own_version(),
+        "orbax": orbax_store.orbax_version(),
         "config": config.to_dict(),
         "keys": {name: str(jax.random.key_impl(leaf)) for name, leaf in leaves.items() if _is_key(leaf)},
         "arrays": {name: _shape_and_dtype(array) for name, array in stored.items()},
         "checksums": {name: _checksum(array) for name, array in stored.items()},
     }
-    arguments = ocp.args.Composite(state=ocp.args.StandardSave(_nonempty(stored)), about=ocp.args.JsonSave(about))
-    with _quiet_errors(), _manager(run) as manager:
-        try:
-            is_saved = manager.save(int(state.step), args=arguments)
-        except ValueError as error:  # tensorstore reports a full disk as a ValueError
-            raise OSError(f"cannot write a checkpoint to {run / CHECKPOINTS}: {_first_line(error)}") from error
+    is_saved = orbax_store.write(run, int(state.step), _nonempty(stored), about)
     if not is_saved:  # Orbax does not save a step that is not after the last one.
         raise CheckpointError(f"{run / CHECKPOINTS} holds step {latest_step(run)} already; train into another folder")
 
 
 def latest_step(run: Path) -> int | None:
     """Returns the step (iterations done) of the last complete checkpoint in a run's folder, None if there is none."""
-    return max(_steps(run), default=None)
-
-
-def _steps(run: Path) -> list[int]:
-    return [int(path.name) for path in (run / CHECKPOINTS).glob("*") if path.name.isdecimal()]
+    return max(orbax_store.steps(run), default=None)
 
 
 def restore(run: Path, template: State, config: Config) -> State:
@@ -122,13 +106,14 @@ def restore(run: Path, template: State, config: Config) -> State:
       The saved state. Checkpoints of version 0.1.0 are converted.
 
     Raises:
-      CheckpointError: the checkpoint is missing, damaged, or belongs to another config or version.
+      CheckpointError: the checkpoint is missing, damaged, unreadable, or belongs to another config or version.
+      OSError: the system cannot read a file of the checkpoint.
     """
     step = latest_step(run)
     if step is None:
         raise CheckpointError(f"no checkpoint in {run / CHECKPOINTS}; start a new run in another folder")
     folder = run / CHECKPOINTS / str(step)
-    about = cast(_About, _read(run, step, "about", ocp.args.JsonRestore()))  # JSON has no static type
+    about = cast(_About, orbax_store.read_about(run, step))  # JSON has no static type
     version = about.get("version", UNVERSIONED)
     _check_config(folder, with_later_fields(about["config"]), config, version)
     described = {name: (shape, dtype) for name, (shape, dtype) in about["arrays"].items()}
@@ -136,11 +121,12 @@ def restore(run: Path, template: State, config: Config) -> State:
     leaves = {name: jax.eval_shape(_data, leaf) for name, leaf in _named_leaves(template).items()}
     expected = {name: _shape_and_dtype(leaf) for name, leaf in leaves.items()}
     _check_arrays(folder, {names[stored]: described[stored] for stored in names}, expected, version)
-    arrays = _read_arrays(run, step, described)
+    empty = {name: np.empty(shape, jnp.dtype(dtype)) for name, (shape, dtype) in described.items()}
+    arrays = empty | orbax_store.read_arrays(run, step, _nonempty(empty))
     # Orbax notices damage to its index, not to the values.
     changed = [name for name, sum_ in about.get("checksums", {}).items() if _checksum(arrays[name]) != sum_]
     if changed:
-        raise _damaged(run, step, f"the values of {changed[0]} differ from those that were saved")
+        raise orbax_store.damaged(run, step, f"the values of {changed[0]} differ from those that were saved")
     current = {names[stored]: array for stored, array in arrays.items() if stored in names}
     keys = {names[stored]: implementation for stored, implementation in about["keys"].items()}
     restored = [_to_leaf(current[name], keys.get(name)) for name in expected]
@@ -169,12 +155,16 @@ def _check_config(folder: Path, saved: Mapping[str, object], config: Config, ver
 def _check_arrays(
     folder: Path, found: Mapping[str, Described], expected: Mapping[str, Described], version: str
 ) -> None:
+    own = _own_version()
+    # In the same version, only another arm or object makes another shape.
+    remedy = f"use vsearch_jax {version} to read it"
+    if version == own:
+        remedy = "restore the files of arm and object as they were when the run was trained"
     for name in [*expected, *found]:
         if found.get(name) != expected.get(name):
             raise CheckpointError(
-                f"checkpoint {folder}, written by vsearch_jax {version}, does not fit vsearch_jax {_own_version()}: "
-                f"{name} is {_text(found.get(name))} in the checkpoint and {_text(expected.get(name))} now; use "
-                f"vsearch_jax {version} to read it"
+                f"checkpoint {folder}, written by vsearch_jax {version}, does not fit vsearch_jax {own}: "
+                f"{name} is {_text(found.get(name))} in the checkpoint and {_text(expected.get(name))} now; {remedy}"
             )
 
 
@@ -186,69 +176,8 @@ def _own_version() -> str:
     return importlib.metadata.version("vsearch_jax")
 
 
-def _manager(run: Path) -> ocp.CheckpointManager:
-    # Not asynchronous: the next chunk donates the arrays, and a save takes less than a second.
-    options = ocp.CheckpointManagerOptions(max_to_keep=NUM_KEPT, enable_async_checkpointing=False)
-    return ocp.CheckpointManager((run / CHECKPOINTS).absolute(), options=options)
-
-
-def _read_arrays(run: Path, step: int, described: Mapping[str, Described]) -> dict[str, np.ndarray]:
-    """Reads all arrays of the checkpoint of `step`; `described` holds shape and dtype of each stored array."""
-    # Orbax needs templates. They are numpy arrays, because it would place JAX arrays on the devices that saved them.
-    empty = {name: np.empty(shape, jnp.dtype(dtype)) for name, (shape, dtype) in described.items()}
-    read = _read(run, step, "state", ocp.args.StandardRestore(_nonempty(empty)))
-    return empty | cast(dict[str, np.ndarray], read)  # orbax returns the structure of the templates
-
-
-def _read(run: Path, step: int, item: str, arguments: ocp.args.CheckpointArgs) -> object:
-    """Reads one item, `state` or `about`, of the checkpoint of `step`."""
-    folder = run / CHECKPOINTS / str(step)
-    try:
-        _check_stored_arrays(folder)
-        with _quiet_errors(), _manager(run) as manager:
-            return manager.restore(step, args=ocp.args.Composite(**{item: arguments}))[item]
-    except (PermissionError, MemoryError):
-        raise
-    except Exception as error:  # A damaged file raises one of a dozen types, from JSON's to tensorstore's.
-        raise _damaged(run, step, _first_line(error)) from error
-
-
-def _damaged(run: Path, step: int, reason: str) -> CheckpointError:
-    earlier = [other for other in _steps(run) if other < step]
-    remedy = "there is no other checkpoint; start a new run in another folder"
-    if earlier:
-        aside = f"move that folder out of {run / CHECKPOINTS} and resume from iteration {max(earlier)}"
-        remedy = f"{aside}: {resume_command(run)}"
-    return CheckpointError(f"checkpoint {run / CHECKPOINTS / str(step)} is damaged ({reason}); {remedy}")
-
-
 def _checksum(array: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data) if array.size else 0
-
-
-@contextlib.contextmanager
-def _quiet_errors() -> Iterator[None]:
-    """Silences what orbax and asyncio print beside the exception that a failed read or write raises."""
-    # Orbax writes arrays concurrently, and the first that fails raises. Orbax also logs a traceback for each thread.
-    # The other arrays find their event loop closed, and Python reports that as an unraisable exception.
-    logs, hook = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
-    levels = [log.level for log in logs]
-    for log in logs:
-        log.setLevel(logging.CRITICAL)
-    sys.unraisablehook = lambda report: None if str(report.exc_value) == "Event loop is closed" else hook(report)
-    yield
-    # Not in a `finally`: after an error the threads may end, and print, long after this block.
-    sys.unraisablehook = hook
-    for log, level in zip(logs, levels, strict=True):
-        log.setLevel(level)
-
-
-def _check_stored_arrays(folder: Path) -> None:
-    """Reads every stored array once, one after the other, and raises at the first that is damaged."""
-    # Orbax reads arrays concurrently. If one is damaged, the threads of the others print tracebacks.
-    store = tensorstore.KvStore.open({"driver": "ocdbt", "base": f"file://{(folder / 'state').absolute()}/"}).result()
-    for read in [store.read(name) for name in store.list().result()]:
-        read.result()
 
 
 def _named_leaves(tree: object) -> dict[str, jax.Array]:
@@ -289,8 +218,3 @@ def _flatten(values: Mapping[str, object], prefix: str = "") -> dict[str, object
     for name, value in values.items():
         flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return flat
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0][:200] if lines else type(error).__name__

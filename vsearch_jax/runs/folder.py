@@ -11,7 +11,8 @@ import os
 import shlex
 import shutil
 import time
-from collections.abc import Iterator
+import unicodedata
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from vsearch_jax.config import Config, ConfigError
@@ -31,7 +32,11 @@ EVENTS = "tensorboard"
 MAX_SEED = 2**32 - 1
 """Largest seed. JAX keeps 32 bits of a seed, so a larger seed would give the same run as a smaller one."""
 
+_SEED, _FILES = "seed", "scene_files"
+"""What `config.json` holds beside the config."""
 _REMEDY = "restore the file from a copy, or train into another folder"
+_UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, of bytes that are no text, and of separators of lines."""
 _NUM_REMOVALS, _SECONDS_BETWEEN_REMOVALS = 40, 0.05
 
 
@@ -45,37 +50,93 @@ class ConfigFileError(ConfigError):
 
 def resume_command(run: Path) -> str:
     """Returns the command line that continues a run, for error messages: it can be pasted into a shell."""
-    return f"vsearch train --out {shlex.quote(str(run))} --resume"
+    path = f"./{run}" if str(run).startswith("-") else str(run)  # An option would start with a hyphen.
+    return f"vsearch train --out {shlex.quote(path)} --resume"
 
 
 def make_new_folder(folder: Path) -> None:
     """Makes the folder for new files, such as a run or an export. An existing empty folder is accepted.
 
     Raises:
-      RunError: the folder is not empty or cannot be made, or `folder` is a file.
+      RunError: the folder is not empty or cannot be made, or `folder` is a file, or its name cannot be printed.
     """
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+    _check_name("folder", folder)
+    if _exists("folder", folder) and not (folder.is_dir() and not any(folder.iterdir())):
         is_run = (folder / CONFIG).is_file()
         hint = f", or continue the run in it: {resume_command(folder)}" if is_run else ""
         raise RunError(f"`folder` is {folder}, which exists; name another folder{hint}")
     _make_folder("folder", folder, folder)
 
 
-def check_new_file(path: Path, suffix: str) -> None:
-    """Checks that a new file can be made at `path`, and makes the folder for it.
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[None]:
+    """Makes the folder for new files, which the `with` block writes. An existing empty folder is accepted.
+
+    If the block raises an exception, the folders that were made here are removed again, unless they hold a file.
+
+    Raises:
+      RunError: the folder is not empty or cannot be made, or `folder` is a file, or its name cannot be printed.
+    """
+    with _removed_after_error(folder):
+        make_new_folder(folder)
+        yield
+
+
+@contextlib.contextmanager
+def new_file(path: Path, suffix: str) -> Iterator[None]:
+    """Checks that a new file can be made at `path`, and makes the folder for it. The `with` block writes the file.
+
+    If the block raises an exception, the folders that were made here are removed again, unless they hold a file.
 
     Args:
       path: the file to be made.
       suffix: how the name of the file must end, for example ".mp4".
 
     Raises:
-      RunError: something exists at `path`, the name does not end in `suffix`, or the folder cannot be made.
+      RunError: something exists at `path`, the name does not end in `suffix` or cannot be printed, or the folder cannot
+        be made.
     """
+    _check_name("path", path)
     if path.suffix.lower() != suffix:
         raise RunError(f"`path` is {path}; name a file that ends in {suffix}")
-    if path.exists():
+    if _exists("path", path):
         raise RunError(f"`path` is {path}, which exists; name another file")
-    _make_folder("path", path, path.parent)
+    with _removed_after_error(path.parent):
+        _make_folder("path", path, path.parent)
+        yield
+
+
+@contextlib.contextmanager
+def _removed_after_error(folder: Path) -> Iterator[None]:
+    """Removes `folder` and its parents after an error, as far as they did not exist before and are empty."""
+    missing = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+    try:
+        yield
+    except BaseException:
+        for path in missing:
+            with contextlib.suppress(OSError):  # It holds a file, or it was not made.
+                path.rmdir()
+        raise
+
+
+def _check_name(option: str, path: Path) -> None:
+    """Raises RunError if a path cannot be printed in one line; an error names the option that gave `path`."""
+    if any(unicodedata.category(character) in _UNPRINTABLE for character in str(path.absolute())):
+        raise RunError(
+            f"`{option}` is {str(path)!a}, a path with a line break, a control character or a byte that is no "
+            "text; name another path"
+        )
+
+
+def _exists(option: str, path: Path) -> bool:
+    """Returns whether something exists at `path`; an error names the option that gave `path`."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        raise _unusable(option, path, f"the system refuses it ({error.strerror})") from error
+    return True
 
 
 def _make_folder(option: str, value: Path, folder: Path) -> None:
@@ -83,29 +144,32 @@ def _make_folder(option: str, value: Path, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        reason = f"the folder {folder} cannot be made ({error.strerror})"
-        raise RunError(f"`{option}` is {value}, but {reason}; name another folder") from error
+        raise _unusable(option, value, f"the folder {folder} cannot be made ({error.strerror})") from error
+
+
+def _unusable(option: str, value: Path, reason: str) -> RunError:
+    return RunError(f"`{option}` is {value}, but {reason}; name another folder")
 
 
 @contextlib.contextmanager
 def new_run_folder(run: Path) -> Iterator[None]:
     """Makes the folder of a new run for a `with` block, which writes the run's first files.
 
-    If the block raises an exception, config and checkpoints are removed. The folder is then empty again.
+    If the block raises an exception, config and checkpoints are removed, and then the folder if it was made here.
 
     Args:
       run: the new folder. An existing empty folder is accepted.
 
     Raises:
-      RunError: the folder is not empty, or `run` is a file.
+      RunError: the folder is not empty, or `run` is a file, or its name cannot be printed.
     """
-    make_new_folder(run)
-    try:
-        yield
-    except BaseException:
-        (run / CONFIG).unlink(missing_ok=True)
-        _remove(run / CHECKPOINTS)
-        raise
+    with new_folder(run):
+        try:
+            yield
+        except BaseException:
+            (run / CONFIG).unlink(missing_ok=True)
+            _remove(run / CHECKPOINTS)
+            raise
 
 
 def _remove(folder: Path) -> None:
@@ -143,18 +207,19 @@ def lock_folder(run: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def write_config(run: Path, config: Config, seed: int) -> None:
-    """Writes config and seed of a run to `config.json` in the run's folder.
+def write_config(run: Path, config: Config, seed: int, files: Mapping[str, object]) -> None:
+    """Writes config and seed of a run, and the fingerprint of its scene, to `config.json` in the run's folder.
 
     Args:
       run: folder of the run.
       config: the run's config.
       seed: the run's seed, from 0 to `MAX_SEED`.
+      files: fingerprint of the scene's files at the start of the run, from `scene.scene_fingerprint`; empty if unknown.
 
     Raises:
       OSError: the disk is full or not writable.
     """
-    write_atomically(run / CONFIG, json.dumps({"seed": seed, **config.to_dict()}, indent=2) + "\n")
+    write_atomically(run / CONFIG, json.dumps({_SEED: seed, **config.to_dict(), _FILES: files}, indent=2) + "\n")
 
 
 def read_config(run: Path) -> Config:
@@ -164,7 +229,7 @@ def read_config(run: Path) -> Config:
       RunError: the folder holds no run.
       ConfigFileError: `config.json` is damaged, or a value in it is out of range.
     """
-    values = {name: value for name, value in _read_json(run).items() if name != "seed"}
+    values = {name: value for name, value in _read_json(run).items() if name not in (_SEED, _FILES)}
     try:
         return Config.from_dict(with_later_fields(values))
     except (ValueError, TypeError, AttributeError) as error:  # a value is out of range or has a wrong type
@@ -178,10 +243,23 @@ def read_seed(run: Path) -> int:
       RunError: the folder holds no run.
       ConfigFileError: `config.json` is damaged, or the seed is out of range.
     """
-    seed = _read_json(run).get("seed")
+    seed = _read_json(run).get(_SEED)
     if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
         raise ConfigFileError(f"{run / CONFIG}: seed is {seed!r}; allowed: 0 to {MAX_SEED}; {_REMEDY}")
     return seed
+
+
+def read_files(run: Path) -> dict[str, object]:
+    """Reads the fingerprint of a run's scene from `config.json`; it is empty in runs of versions before 0.3.0.
+
+    Raises:
+      RunError: the folder holds no run.
+      ConfigFileError: `config.json` is damaged.
+    """
+    files = _read_json(run).get(_FILES, {})
+    if not isinstance(files, dict):
+        raise ConfigFileError(f"{run / CONFIG}: {_FILES} is no JSON object; {_REMEDY}")
+    return files
 
 
 def _read_json(run: Path) -> dict[str, object]:

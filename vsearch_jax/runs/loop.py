@@ -26,12 +26,14 @@ from vsearch_jax.runs.folder import (
     RunError,
     new_run_folder,
     read_config,
+    read_files,
     read_seed,
     resume_command,
     write_config,
 )
 from vsearch_jax.runs.interrupts import OnInterrupt, call_interruptibly, stop_on_signal
 from vsearch_jax.runs.metrics_log import STAGES, MetricsLine, MetricsLog, read_metrics
+from vsearch_jax.scene import check_unchanged, scene_fingerprint
 from vsearch_jax.training import init, train
 from vsearch_jax.types import ReachabilityMap, TrainState
 
@@ -46,7 +48,7 @@ def _ignore(*_: object) -> None:
 def start_run(run: Path, config: Config, seed: int) -> TrainState:
     """Starts a new run: makes its folder, computes the untrained state, and saves this state as the first checkpoint.
 
-    If this fails, the folder is left empty.
+    If this fails, nothing is left of the folder; a folder that was there before is empty again.
 
     Args:
       run: folder of the run; a folder that does not exist yet, or an empty one.
@@ -65,10 +67,11 @@ def start_run(run: Path, config: Config, seed: int) -> TrainState:
     if not 0 <= seed <= MAX_SEED:
         raise ConfigError(f"`seed` is {seed}; allowed: 0 to {MAX_SEED}")
     with new_run_folder(run):
+        files = scene_fingerprint(config.scene, config.env)
         state = call_interruptibly(init, jax.random.key(seed), config)
         # Only the evaluation needs the target. Checked here, the error comes before the training, not after it.
         check_target(state.reach, config)
-        write_config(run, config, seed)
+        write_config(run, config, seed, files)
         checkpoint.save(run, state, config)
     return state
 
@@ -85,15 +88,17 @@ def resume_run(run: Path, config: Config) -> TrainState:
 
     Raises:
       RunError: the folder holds no run.
+      SceneError: a file of the scene has changed since the run was started.
       CheckpointError: the checkpoint is missing, damaged, or belongs to another config or version.
       ConfigError: the arm cannot reach the target view.
     """
-    saved, seed = read_config(run), read_seed(run)
+    saved, seed, files = read_config(run), read_seed(run), read_files(run)
+    check_unchanged(saved.scene, saved.env, files)
     template = jax.eval_shape(lambda key: init(key, config), jax.random.key(0))
     state = checkpoint.restore(run, template, config)
     check_target(state.reach, config)
     if saved != config:
-        write_config(run, config, seed)
+        write_config(run, config, seed, files)
     return state
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import math
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.summary import scalar
 
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.folder import EVENTS, METRICS, RunError
@@ -77,7 +80,12 @@ class MetricsLog:
         self.lines = [line for line in read_metrics(run) if line["iteration"] < step]
         self._path = run / METRICS
         write_atomically(self._path, "".join(json.dumps(line) + "\n" for line in self.lines))
-        self._events = SummaryWriter(str(run / EVENTS), purge_step=step)
+        (run / EVENTS).mkdir(exist_ok=True)
+        # Not SummaryWriter: it writes in a thread, where an error of the disk is a traceback and no exception.
+        self._events = EventsWriter(str(run / EVENTS / "events"))
+        # TensorBoard hides the events of this step and later from files before this one.
+        self._add_event(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
+        self._events.flush()
 
     def append(self, metrics: Mapping[str, np.ndarray], first: int, seconds: float) -> None:
         """Appends the metrics of a chunk of n iterations, one line for each, and waits until the lines are on disk.
@@ -104,9 +112,14 @@ class MetricsLog:
             os.fsync(file.fileno())
         for line in new:
             for name in line.keys() - {"iteration", "stage"}:
-                self._events.add_scalar(f"{line['stage']}/{name}", line[name], line["iteration"])
+                summary = scalar(f"{line['stage']}/{name}", line[name])
+                self._add_event(Event(step=line["iteration"], summary=summary))
         self._events.flush()
         self.lines += new
+
+    def _add_event(self, event: Event) -> None:
+        event.wall_time = time.time()
+        self._events.write_event(event)
 
     def close(self) -> None:
         """Closes the TensorBoard events file. `metrics.jsonl` needs no closing."""

@@ -2,7 +2,19 @@
 
 from vsearch_jax.scene.assembly import Scene, build_scene
 from vsearch_jax.scene.files import SceneError, available, xml_folder
+from vsearch_jax.scene.fingerprint import Fingerprint, check_unchanged, scene_fingerprint
 from vsearch_jax.scene.joint_chain import joints_above
 from vsearch_jax.scene.surface import describe_symmetry
 
-__all__ = ["Scene", "SceneError", "available", "build_scene", "describe_symmetry", "joints_above", "xml_folder"]
+__all__ = [
+    "Fingerprint",
+    "Scene",
+    "SceneError",
+    "available",
+    "build_scene",
+    "check_unchanged",
+    "describe_symmetry",
+    "joints_above",
+    "scene_fingerprint",
+    "xml_folder",
+]
