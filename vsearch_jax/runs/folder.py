@@ -14,10 +14,12 @@ import time
 import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import cast
 
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.old_versions import with_later_fields
+from vsearch_jax.scene import Fingerprint
 
 try:
     import fcntl
@@ -249,7 +251,7 @@ def read_seed(run: Path) -> int:
     return seed
 
 
-def read_files(run: Path) -> dict[str, object]:
+def read_files(run: Path) -> Fingerprint:
     """Reads the fingerprint of a run's scene from `config.json`; it is empty in runs of versions before 0.3.0.
 
     Raises:
@@ -257,9 +259,10 @@ def read_files(run: Path) -> dict[str, object]:
       ConfigFileError: `config.json` is damaged.
     """
     files = _read_json(run).get(_FILES, {})
-    if not isinstance(files, dict):
-        raise ConfigFileError(f"{run / CONFIG}: {_FILES} is no JSON object; {_REMEDY}")
-    return files
+    parts = files.values() if isinstance(files, dict) else [None]
+    if not all(isinstance(part, dict) and isinstance(part.get("files"), dict) and "model" in part for part in parts):
+        raise ConfigFileError(f"{run / CONFIG}: {_FILES} is damaged; {_REMEDY}")
+    return cast(Fingerprint, files)
 
 
 def _read_json(run: Path) -> dict[str, object]:
