@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from jaxlie import SE3
 
-from vsearch_jax.render.geometry.rasterizer import Pinhole
+from vsearch_jax.render.geometry.projection import Pinhole
 from vsearch_jax.render.mj_poses import CameraPoses
 from vsearch_jax.render.scene import RenderError
 from vsearch_jax.types import Camera

@@ -13,7 +13,8 @@ from jax import Array
 
 from vsearch_jax.render import trace
 from vsearch_jax.render.cameras import pinhole, pixel_rays, scale_resolution
-from vsearch_jax.render.geometry.rasterizer import Pinhole, Projection, Raster, rasterize
+from vsearch_jax.render.geometry.projection import Pinhole, Projection
+from vsearch_jax.render.geometry.rasterizer import Raster, rasterize
 from vsearch_jax.render.light import shading
 from vsearch_jax.render.light.lighting import (
     LightPoses,
