@@ -42,7 +42,7 @@ def _grid_box(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndar
 
 
 def _models(rng: np.random.Generator) -> tuple[mujoco.MjModel, mujoco.MjModel]:
-    """Returns a model of a cube mesh and a flat height field, and the same solids as boxes, whose rays have no edges."""
+    """Returns a model of a cube mesh and a flat height field, and one with the same solids as boxes."""
     edge = rng.choice([0.1, 0.125, 0.11])
     vertices, faces = _grid_box(6, rng)
     spec, boxes = mujoco.MjSpec(), mujoco.MjSpec()

@@ -115,6 +115,13 @@ class RenderScene:
         """Number of visible geoms that are not made of triangles. Their rows come first in the scene's arrays."""
         return sum(kind not in TRIANGLE_TYPES for kind in self.geom_types)
 
+    @property
+    def shadow_casters(self) -> tuple[int, ...]:
+        """Rows of the lights that cast shadows."""
+        return tuple(
+            row for row, is_shadowing in enumerate(self.lights.is_shadowing) if is_shadowing and self.has_shadows
+        )
+
 
 def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1, 2)) -> RenderScene:
     """Compiles the visible geoms, the materials and the lights of a model for `render`.

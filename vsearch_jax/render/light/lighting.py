@@ -56,11 +56,6 @@ def light_poses(scene: RenderScene, data: GeomPoses, camera: Camera) -> LightPos
     return LightPoses(jnp.stack(positions), jnp.stack(directions))
 
 
-def _shadow_casters(scene: RenderScene) -> list[int]:
-    """Returns the rows of the lights that cast shadows."""
-    return [i for i, casts in enumerate(scene.lights.is_shadowing) if casts and scene.has_shadows]
-
-
 def _light_source(scene: RenderScene, poses: LightPoses, index: int) -> tuple[Array, bool]:
     """Returns f32[3] and whether the light is directional: a direction towards such a light, else a position in m."""
     is_directional = scene.lights.is_directional[index]
@@ -69,7 +64,7 @@ def _light_source(scene: RenderScene, poses: LightPoses, index: int) -> tuple[Ar
 
 def needs_shadow_maps(scene: RenderScene) -> bool:
     """Returns whether a shadow map is needed: the scene has meshes or height fields, and a light that casts shadows."""
-    return scene.triangles is not None and bool(_shadow_casters(scene))
+    return scene.triangles is not None and bool(scene.shadow_casters)
 
 
 def shadow_maps(
@@ -89,7 +84,7 @@ def shadow_maps(
     """
     return {
         i: shadow_map.draw_shadow_map(scene, frames, seen, _light_source(scene, poses, i), zero)
-        for i in _shadow_casters(scene)
+        for i in scene.shadow_casters
     }
 
 
@@ -116,7 +111,7 @@ def lit_by(
     """
     poses, maps = jax.lax.stop_gradient(lights)
     lit = {}
-    for index in _shadow_casters(scene):
+    for index in scene.shadow_casters:
         source, is_directional = _light_source(scene, poses, index)
         fixed = jax.lax.stop_gradient((scene, frames, hits, rays, source))
         lit[index] = trace.is_lit(*fixed, is_directional)
