@@ -13,21 +13,21 @@ from jax import Array
 
 from vsearch_jax.render import trace
 from vsearch_jax.render.cameras import pinhole, pixel_rays, scale_resolution
+from vsearch_jax.render.errors import RenderError
 from vsearch_jax.render.geometry.projection import Pinhole, Projection
 from vsearch_jax.render.geometry.rasterizer import Raster, rasterize
 from vsearch_jax.render.light import shading
 from vsearch_jax.render.light.lighting import (
-    LightPoses,
     incidences,
-    light_poses,
     lit_by,
     needs_shadow_maps,
     shadow_maps,
 )
 from vsearch_jax.render.light.shadow_map import ShadowMap
+from vsearch_jax.render.light.sources import LightPoses, light_poses
 from vsearch_jax.render.mj_poses import GeomPoses
 from vsearch_jax.render.pixels import resolve_surface
-from vsearch_jax.render.scene import RenderError, RenderScene
+from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.render.texture import lookup
 from vsearch_jax.render.tiling import Tiling
 from vsearch_jax.types import Camera, Image
@@ -103,7 +103,7 @@ def render(
     """
     if not all(0 < count <= _MAX_EDGE for count in size):
         raise RenderError(f"size is {size}; allowed: height and width from 1 to {_MAX_EDGE}")
-    frames, lights = _camera_frames(scene, data, camera), light_poses(scene, data, camera)
+    frames, lights = _camera_frames(scene, data, camera), light_poses(scene.lights, data, camera)
     return _draw(scene, frames, lights, camera, (size[0], size[1]), shade)
 
 

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.render.scene import Lights, RenderScene
+from vsearch_jax.render.light.sources import Lights
+from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.xla.vectors import Vector, dot
 
 # Lower bound of squared lengths, so that the gradients of their roots are finite.
