@@ -114,3 +114,12 @@ def test_each_mipmap_level_has_the_mean_of_the_texture(size: tuple[int, int], ki
         texels = np.asarray(atlas.texels)[starts[side, level] : starts[side, level] + count]
         means = [(texels >> shift & 0xFF).mean() for shift in (0, 8, 16)]
         np.testing.assert_allclose(means, images[side % len(images)].mean(axis=0), atol=0.51)
+
+
+def test_endless_plane_with_a_uniform_cube_compiles_without_a_warning() -> None:
+    model = _model(
+        '<geom type="plane" size="0 0 1" material="dice"/>',
+        '<material name="dice" texture="cube" texuniform="true"/>',
+    )
+    with np.errstate(all="raise"):
+        assert compile_textures(model, np.array([0])) is not None

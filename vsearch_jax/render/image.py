@@ -78,7 +78,8 @@ def render(
     visible part of the scene. There is no near or far plane.
 
     The camera and the lights must be outside all solids. From inside a solid, its wall is lit as from outside, and
-    shadows are wrong.
+    shadows are wrong. A camera or a geom with NaN in its pose is not an error: the image of such a camera shows nothing
+    (depth +inf, geom_id -1), and such a geom is not drawn.
 
     Derivatives are those of the geom that each pixel shows. They are finite. They do not include the motion of outlines
     and of shadow edges; for outlines see `soft_silhouette`.

@@ -12,6 +12,7 @@ from jax import Array
 from mujoco import mjtGeom, mjtObj, mjtTexture
 
 from vsearch_jax.render.errors import RenderError
+from vsearch_jax.render.geometry.coincidence import hidden_geoms
 from vsearch_jax.render.geometry.rays import RAY_FUNCTIONS
 from vsearch_jax.render.geometry.triangles import TRIANGLE_TYPES, Triangles, compile_triangles
 from vsearch_jax.render.light.sources import Lights, compile_lights
@@ -93,7 +94,8 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
 
     A geom is invisible if its colour has alpha 0 or its group is not in `geom_groups`. Any other alpha is drawn as 1,
     with a warning in the log. The alpha of textures is ignored. Of a material's textures only the colour texture is
-    drawn. Of several skyboxes the first is drawn.
+    drawn. Of several skyboxes the first is drawn. Of geoms of one shape in one place, such as a visual and a collision
+    geom, the one of the higher group is drawn, then the one of the higher id.
 
     Args:
       mj_model: the compiled MuJoCo model.
@@ -145,6 +147,7 @@ def _visible_geoms(model: mujoco.MjModel, geom_groups: tuple[int, ...], alpha: n
         )
     for geom in visible:
         _check_geom(model, int(geom))
+    visible = np.setdiff1d(visible, hidden_geoms(model, visible, alpha))
     transparent = [model.geom(g).name or f"number {g}" for g in visible.tolist() if alpha[g] < 1.0]
     if transparent:
         _LOG.warning("these geoms have an alpha below 1 but are drawn opaque: %s", ", ".join(transparent))

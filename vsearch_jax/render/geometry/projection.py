@@ -152,7 +152,7 @@ def project_faces(triangles: Triangles, projection: Projection, size: tuple[int,
       zero: i32[], a 0 that the compiler does not know to be 0. It keeps XLA from computing results twice.
     """
     pinhole = projection.pinhole
-    x, y, depth = _to_view(projection, triangles.geom, triangles.corners, zero)
+    x, y, depth = _to_view(projection, triangles.geom, triangles.corners_of_geoms, zero)
     w = jnp.ones_like(depth) if projection.is_parallel else depth
     columns = _pixel_interval(list(x), list(w), pinhole.scale_x, pinhole.center_x, size[1])
     rows = _pixel_interval(list(y), list(w), pinhole.scale_y, pinhole.center_y, size[0])

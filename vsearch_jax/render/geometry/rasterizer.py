@@ -53,7 +53,7 @@ class Raster(NamedTuple):
 
     Attributes:
       depth: f32[H, W] m along the view's axis, +inf on a miss.
-      face: i32[H, W], row of the face in `Triangles`; 0 on a miss.
+      face: i32[H, W], number of the face among those of all geoms of `Triangles`; 0 on a miss.
     """
 
     depth: Array

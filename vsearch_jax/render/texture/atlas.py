@@ -193,7 +193,8 @@ def _mapping(model: mujoco.MjModel, geom: int) -> _Mapping:
     if model.tex_type[texture] != mjtTexture.mjTEXTURE_2D:
         # MuJoCo draws primitives as scaled unit solids, but planes, meshes and height fields in metres.
         is_scaled = kind not in (*TRIANGLE_TYPES, int(mjtGeom.mjGEOM_PLANE))
-        extent = np.where(is_scaled, half_sizes, 1.0) / (half_sizes if is_uniform else 1.0)
+        with np.errstate(divide="ignore"):  # along an endless axis, of size 0, OpenGL's direction does not change
+            extent = np.where(is_scaled, half_sizes, 1.0) / (half_sizes if is_uniform else 1.0)
         return _Mapping(CUBE, np.ones(2), np.zeros(2), extent)
     stretch = np.where((half_sizes[:2] > 0.0) & is_uniform, half_sizes[:2], 1.0)
     has_texcoord = kind == mjtGeom.mjGEOM_MESH and model.mesh_texcoordadr[model.geom_dataid[geom]] >= 0
