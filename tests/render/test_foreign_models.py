@@ -18,7 +18,7 @@ from vsearch_jax import render
 
 SIZE = (120, 160)
 WHEELS = ("dm_control==1.0.50", "gymnasium==1.4.0")
-FOLDERS = ("dm_control/suite/*.xml", "gymnasium/envs/mujoco/assets/*.xml")
+FOLDERS = ("dm_control/suite/*.xml", "dm_control/locomotion/**/*.xml", "gymnasium/envs/mujoco/assets/*.xml")
 # Draws camera 0 of each model file (arguments) without the effects that we do not render, and saves it beside the file.
 DRAW_WITH_MUJOCO = """
 import sys, mujoco, numpy as np
@@ -91,7 +91,7 @@ def _mean_error(model: mujoco.MjModel, expected: np.ndarray) -> float:
 
 @pytest.mark.slow
 def test_colours_of_foreign_models_equal_mujocos_renderer(tmp_path: Path) -> None:
-    models = {path.stem: _with_camera(path) for path in _unpack_wheels(tmp_path)}
+    models = {f"{path.parts[-3]}-{path.stem}": _with_camera(path) for path in _unpack_wheels(tmp_path)}
     drawn = {name: model for name, model in models.items() if model is not None}
     paths = {name: tmp_path / f"{name}.mjb" for name in drawn}
     for name, model in drawn.items():

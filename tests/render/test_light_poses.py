@@ -11,7 +11,7 @@ import pytest
 
 from oracles.render import forward
 from vsearch_jax import render
-from vsearch_jax.render.light.sources import light_poses
+from vsearch_jax.render.lights import light_poses
 from vsearch_jax.types import Camera
 
 MODES = ("fixed", "track", "trackcom", "targetbody", "targetbodycom")

@@ -24,7 +24,7 @@ from vsearch_jax.render.light.lighting import (
     shadow_maps,
 )
 from vsearch_jax.render.light.shadow_map import ShadowMap
-from vsearch_jax.render.light.sources import LightPoses, light_poses
+from vsearch_jax.render.lights import LightPoses, light_poses
 from vsearch_jax.render.mj_poses import GeomPoses
 from vsearch_jax.render.pixels import resolve_surface
 from vsearch_jax.render.scene import RenderScene

@@ -15,7 +15,7 @@ from vsearch_jax.render.errors import RenderError
 from vsearch_jax.render.geometry.coincidence import hidden_geoms
 from vsearch_jax.render.geometry.rays import RAY_FUNCTIONS
 from vsearch_jax.render.geometry.triangles import TRIANGLE_TYPES, Triangles, compile_triangles
-from vsearch_jax.render.light.sources import Lights, compile_lights
+from vsearch_jax.render.lights import Lights, compile_lights
 from vsearch_jax.render.texture.atlas import Textures, compile_textures, rgb_texture
 
 # Defaults of MuJoCo's renderer for a geom without a material (mjv_initGeom).

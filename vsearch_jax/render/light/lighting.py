@@ -14,7 +14,7 @@ from jax import Array
 from vsearch_jax.render import trace
 from vsearch_jax.render.light import shading, shadow_map
 from vsearch_jax.render.light.shadow_map import ShadowMap
-from vsearch_jax.render.light.sources import LightPoses
+from vsearch_jax.render.lights import LightPoses
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.xla.vectors import Vector
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.render.light.sources import Lights
+from vsearch_jax.render.lights import Lights
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.xla.vectors import Vector, dot
 
