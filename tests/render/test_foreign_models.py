@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -80,7 +81,7 @@ def _mean_error(model: mujoco.MjModel, expected: np.ndarray) -> float:
     scene, eye = render.compile_scene(model), render.camera(frames, model, model.ncam - 1)
     draw = jax.jit(render.render, static_argnames="size")
     image = draw(scene, frames, eye, size=SIZE)
-    without_shadows = draw(scene.replace(has_shadows=False), frames, eye, size=SIZE)
+    without_shadows = draw(dataclasses.replace(scene, has_shadows=False), frames, eye, size=SIZE)
     _, ids = cast_image(model, data, model.ncam - 1, SIZE)
     is_shaded = np.abs(np.asarray(image.rgb - without_shadows.rgb)).sum(axis=-1) > 0.01
     alpha = np.where(model.geom_matid < 0, 1.0, np.append(model.mat_rgba[:, 3], 1.0)[model.geom_matid])

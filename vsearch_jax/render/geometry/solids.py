@@ -82,10 +82,10 @@ def _enters_before_it_leaves(vertices: np.ndarray, faces: np.ndarray) -> bool:
     line = first[face] + np.stack([rank % counts[face, 0], rank // counts[face, 0]], axis=-1)
     sides, areas = _sides(pixels, faces[face], line)
     is_front, is_back = sides.all(axis=1), ~sides.any(axis=1)
-    is_hit = (is_front | is_back) & (areas.sum(axis=1) != 0.0)
+    is_hit = np.logical_and(is_front | is_back, areas.sum(axis=1) != 0.0)
     height = np.sum(areas[is_hit] * vertices[faces[face[is_hit]], 2], axis=1) / areas[is_hit].sum(axis=1)
     number = line[is_hit] @ np.array([1, num_lines + 1])
-    sign = np.where(is_front[is_hit], 1, -1)
+    sign = np.where(is_front, 1, -1)[is_hit]
     # From above; of faces that touch, the entry comes first.
     order = np.lexsort((-sign, -np.round(height / (_TOUCH * extent)), number))
     # Each line leaves the closed mesh as often as it enters, so the sum is 0 at the end of each line.
