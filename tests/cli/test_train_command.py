@@ -182,7 +182,7 @@ def test_a_folder_in_use_is_refused(fast: None, capsys: pytest.CaptureFixture[st
         assert "another process uses" in user_error(capsys, "eval", str(out))
 
 
-@pytest.mark.parametrize(("file_limit", "is_started"), [(1_000, False), (2_500, False), (9_000, True)])
+@pytest.mark.parametrize(("file_limit", "is_started"), [(1_000, False), (2_500, False), (12_000, True)])
 def test_a_full_disk_is_one_line_and_keeps_what_was_saved(tmp_path: Path, file_limit: int, is_started: bool) -> None:
     out = tmp_path / "run"
     # No file may grow beyond the limit. The first larger file is config.json, the first checkpoint or a figure.

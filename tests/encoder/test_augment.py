@@ -16,7 +16,8 @@ from vsearch_jax import encoder as encoders
 from vsearch_jax.config import PRESETS, Config
 from vsearch_jax.encoder import augment, network
 from vsearch_jax.render import compile_scene
-from vsearch_jax.render.scene import Lights, RenderScene
+from vsearch_jax.render.lights import Lights
+from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.types import Camera
 
 INPUTS = ("rgb", "depth", "silhouette")

@@ -71,8 +71,19 @@ def test_errors_of_cameras_name_the_camera(model: mujoco.MjModel, data: mujoco.M
         render.camera(data, model, "flat")
     with pytest.raises(render.RenderError, match=r"'sensor' has a sensorsize.*size=\(height, width\)"):
         render.camera(data, model, "sensor")
-    with pytest.raises(render.RenderError, match="no camera 'other'; it has: plain, sensor, flat"):
+    with pytest.raises(render.RenderError, match="no camera 'other'; it has: 'plain', 'sensor', 'flat'"):
         render.camera(data, model, "other")
+
+
+def test_a_camera_without_a_name_is_reached_by_its_number() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom size=".5"/><camera name="front" pos="0 -2 0"/>
+      <camera pos="0 0 2" fovy="50"/></worldbody></mujoco>""")
+    data = forward(model)
+    np.testing.assert_allclose(render.camera(data, model, 1).position, [0.0, 0.0, 2.0])
+    jax.tree.map(np.testing.assert_array_equal, render.camera(data, model, 0), render.camera(data, model, "front"))
+    for number in (2, -1):
+        with pytest.raises(render.RenderError, match=f"no camera number {number}; it has: 'front', number 1"):
+            render.camera(data, model, number)
 
 
 @pytest.mark.parametrize("fovy", [45, 0.0, float("nan")])

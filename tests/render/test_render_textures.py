@@ -9,6 +9,7 @@ import pytest
 
 from oracles.render import cast_points, forward, poses
 from vsearch_jax import render
+from vsearch_jax.render.texture.atlas import compile_textures
 
 SIZE = (48, 64)
 TEXTURES = """
@@ -66,3 +67,59 @@ def test_cube_texture_has_its_second_colour_on_one_side(kind: str) -> None:
     # MuJoCo's flat cube has rgb2 on its third side. OpenGL's reflection coordinates put this side at -y.
     colours = [middle_colour(euler) for euler in ("-90 0 0", "90 0 0")]
     assert min(float(np.abs(c - [0, 0, 1]).max()) for c in colours) < 0.02
+
+
+def test_bright_light_and_srgb_equal_mujocos_renderer() -> None:
+    """The numbers are those of `mujoco.Renderer`. Each light that casts shadows is clamped alone; cubes stay linear."""
+    texture = '<texture builtin="flat" rgb1=".5 .5 .5" rgb2=".5 .5 .5" width="8" '
+    model = mujoco.MjModel.from_xml_string(f"""
+      <mujoco><visual><headlight ambient=".4 .4 .4" diffuse=".5 .5 .5" specular="0 0 0"/></visual>
+      <asset>
+        {texture} name="linear" type="2d" height="8"/>
+        {texture} name="srgb" type="2d" height="8" colorspace="sRGB"/>
+        {texture} name="cube" type="cube" height="48" colorspace="sRGB"/>
+        <material name="linear" texture="linear" rgba="1 1 1 1" specular="0"/>
+        <material name="srgb" texture="srgb" rgba="1 1 1 1" specular="0"/>
+        <material name="cube" texture="cube" rgba="1 1 1 1" specular="0"/>
+      </asset>
+      <worldbody>
+        <light type="directional" dir="0 0 -1" diffuse=".7 .7 .7" specular="0 0 0"/>
+        <geom type="box" size=".1 .1 .1" pos="-.4 0 0" material="linear"/>
+        <geom type="box" size=".1 .1 .1" material="srgb"/>
+        <geom type="box" size=".1 .1 .1" pos=".4 0 0" material="cube"/>
+        <camera name="eye" pos="0 0 2" fovy="50"/>
+      </worldbody></mujoco>""")
+    rgb = 255.0 * _rgb(model)
+    scale = SIZE[0] / (2.0 * 1.9 * np.tan(np.deg2rad(25.0)))  # pixels per m on top of the boxes
+    columns = [int(0.5 * SIZE[1] + scale * x) for x in (-0.4, 0.0, 0.4)]
+    np.testing.assert_allclose(rgb[SIZE[0] // 2, columns], [[203] * 3, [86] * 3, [203] * 3], atol=0.75)
+
+
+@pytest.mark.parametrize("size", [(100, 100), (63, 63), (17, 300), (1, 7), (64, 64)])
+@pytest.mark.parametrize("kind", ["2d", "cube"])
+def test_each_mipmap_level_has_the_mean_of_the_texture(size: tuple[int, int], kind: str) -> None:
+    height, width = (size[0], size[1]) if kind == "2d" else (6 * size[1], size[1])
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco>
+      <asset><texture name="t" type="{kind}" builtin="flat" rgb1="1 0 0" width="{width}" height="{height}"/>
+      <material name="m" texture="t"/></asset><worldbody><geom size="1" material="m"/></worldbody></mujoco>""")
+    model.tex_data[:] = np.random.default_rng(0).integers(0, 256, model.tex_data.size)
+    model.tex_data[: model.tex_data.size // 2] //= 2
+    atlas = compile_textures(model, np.array([0]))
+    assert atlas is not None
+    images = model.tex_data.reshape(-1, (height if kind == "2d" else width) * width, 3)
+    starts = np.asarray(atlas.start).reshape(6, atlas.num_levels)
+    side_height, side_width = (int(n[0]) for n in (atlas.height, atlas.width))
+    for side, level in np.ndindex(starts.shape):
+        count = max(side_height >> level, 1) * max(side_width >> level, 1)
+        texels = np.asarray(atlas.texels)[starts[side, level] : starts[side, level] + count]
+        means = [(texels >> shift & 0xFF).mean() for shift in (0, 8, 16)]
+        np.testing.assert_allclose(means, images[side % len(images)].mean(axis=0), atol=0.51)
+
+
+def test_endless_plane_with_a_uniform_cube_compiles_without_a_warning() -> None:
+    model = _model(
+        '<geom type="plane" size="0 0 1" material="dice"/>',
+        '<material name="dice" texture="cube" texuniform="true"/>',
+    )
+    with np.errstate(all="raise"):
+        assert compile_textures(model, np.array([0])) is not None

@@ -10,20 +10,20 @@ import numpy as np
 from jax import Array
 from jaxlie import SE3
 
-from vsearch_jax.render.geometry.rasterizer import Pinhole
+from vsearch_jax.render.errors import RenderError
+from vsearch_jax.render.geometry.projection import Pinhole
 from vsearch_jax.render.mj_poses import CameraPoses
-from vsearch_jax.render.scene import RenderError
 from vsearch_jax.types import Camera
 
 
-def camera(data: CameraPoses, mj_model: mujoco.MjModel, name: str, size: tuple[int, int] | None = None) -> Camera:
-    """Returns the camera `name` of a MuJoCo model, at the pose that `data` holds for it.
+def camera(data: CameraPoses, mj_model: mujoco.MjModel, name: str | int, size: tuple[int, int] | None = None) -> Camera:
+    """Returns a camera of a MuJoCo model, at the pose that `data` holds for it. All of MuJoCo's camera modes work.
 
     Args:
       data: poses of the model's ncam cameras: `mjx.Data`, `Poses`, or any object with the positions cam_xpos
         f32[ncam, 3] m in world and the rotations cam_xmat f32[ncam, 3, 3], camera to world.
       mj_model: model of `data`. It gives the field of view, or the sensor size, focal lengths and principal point.
-      name: name of the camera in the model.
+      name: name of the camera in the model, or its number from 0, which also reaches a camera without a name.
       size: height and width of the images in pixels. Needed only for a camera with a `sensorsize`. Such a camera may
         have pixels that are not square and an optical axis that is not central.
 
@@ -31,19 +31,26 @@ def camera(data: CameraPoses, mj_model: mujoco.MjModel, name: str, size: tuple[i
       The camera in the world frame, of f32 arrays without batch axes.
 
     Raises:
-      RenderError: the model has no camera of this name, the camera is orthographic, or it has a sensor and `size` is
-        None.
+      RenderError: the model has no camera of this name or number, the camera is orthographic, or it has a sensor and
+        `size` is None.
     """
-    camera_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, name)
-    if camera_id < 0:
-        names = ", ".join(mj_model.cam(i).name for i in range(mj_model.ncam)) or "none"
-        raise RenderError(f"the model has no camera {name!r}; it has: {names}")
+    camera_id = _camera_id(mj_model, name)
     if mj_model.cam_projection[camera_id] != mujoco.mjtProjection.mjPROJ_PERSPECTIVE:
         raise RenderError(f"camera {name!r} is orthographic, which cannot be rendered; make it a perspective camera")
     fovy = jnp.deg2rad(jnp.float32(mj_model.cam_fovy[camera_id]))
     rotation = jnp.asarray(data.cam_xmat[camera_id], dtype=jnp.float32).reshape(3, 3)
     position = jnp.asarray(data.cam_xpos[camera_id], dtype=jnp.float32)
     return Camera(position, rotation, fovy, _sensor_intrinsics(mj_model, camera_id, size))
+
+
+def _camera_id(mj_model: mujoco.MjModel, name: str | int) -> int:
+    is_name = isinstance(name, str)
+    camera_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, name) if is_name else int(name)
+    if not 0 <= camera_id < mj_model.ncam:
+        labels = [repr(mj_model.cam(i).name) if mj_model.cam(i).name else f"number {i}" for i in range(mj_model.ncam)]
+        request = repr(name) if is_name else f"number {name}"
+        raise RenderError(f"the model has no camera {request}; it has: {', '.join(labels) or 'none'}")
+    return camera_id
 
 
 def _sensor_intrinsics(mj_model: mujoco.MjModel, camera_id: int, size: tuple[int, int] | None) -> Array | None:

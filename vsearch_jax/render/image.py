@@ -13,20 +13,21 @@ from jax import Array
 
 from vsearch_jax.render import trace
 from vsearch_jax.render.cameras import pinhole, pixel_rays, scale_resolution
-from vsearch_jax.render.geometry.rasterizer import Pinhole, Projection, Raster, rasterize
+from vsearch_jax.render.errors import RenderError
+from vsearch_jax.render.geometry.projection import Pinhole, Projection
+from vsearch_jax.render.geometry.rasterizer import Raster, rasterize
 from vsearch_jax.render.light import shading
 from vsearch_jax.render.light.lighting import (
-    LightPoses,
     incidences,
-    light_poses,
     lit_by,
     needs_shadow_maps,
     shadow_maps,
 )
 from vsearch_jax.render.light.shadow_map import ShadowMap
+from vsearch_jax.render.lights import LightPoses, light_poses
 from vsearch_jax.render.mj_poses import GeomPoses
 from vsearch_jax.render.pixels import resolve_surface
-from vsearch_jax.render.scene import RenderError, RenderScene
+from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.render.texture import lookup
 from vsearch_jax.render.tiling import Tiling
 from vsearch_jax.types import Camera, Image
@@ -77,7 +78,8 @@ def render(
     visible part of the scene. There is no near or far plane.
 
     The camera and the lights must be outside all solids. From inside a solid, its wall is lit as from outside, and
-    shadows are wrong.
+    shadows are wrong. A camera or a geom with NaN in its pose is not an error: the image of such a camera shows nothing
+    (depth +inf, geom_id -1), and such a geom is not drawn.
 
     Derivatives are those of the geom that each pixel shows. They are finite. They do not include the motion of outlines
     and of shadow edges; for outlines see `soft_silhouette`.
@@ -102,7 +104,7 @@ def render(
     """
     if not all(0 < count <= _MAX_EDGE for count in size):
         raise RenderError(f"size is {size}; allowed: height and width from 1 to {_MAX_EDGE}")
-    frames, lights = _camera_frames(scene, data, camera), light_poses(scene, data, camera)
+    frames, lights = _camera_frames(scene, data, camera), light_poses(scene.lights, data, camera)
     return _draw(scene, frames, lights, camera, (size[0], size[1]), shade)
 
 

@@ -9,6 +9,7 @@ from jaxlie import SO3
 
 from vsearch_jax.render import trace
 from vsearch_jax.render.geometry.level_sets import affine, level, select
+from vsearch_jax.render.geometry.triangles import NUM_ROWS
 from vsearch_jax.render.light.shading import Surface
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.render.texture import lookup
@@ -17,10 +18,6 @@ from vsearch_jax.xla.vectors import Vector, dot
 
 _Quaternion = tuple[Array, Array, Array, Array]
 """w, x, y and z."""
-
-# Rows of `Triangles.surface`: normal and offset of the face's plane (4), affine map to the smooth normal (12), affine
-# map to texture coordinates (8).
-_NUM_ROWS_WITHOUT_TEXCOORD, _NUM_ROWS = 16, 24
 
 
 def _look_up(table: Array | list[Array], index: Array) -> list[Array]:
@@ -117,8 +114,7 @@ def _face_rows(scene: RenderScene, hits: trace.Hits, zero: Array) -> list[Array]
     """Returns the rows of `Triangles.surface` for each pixel's face, or None without triangles."""
     if scene.triangles is None:
         return None
-    count = _NUM_ROWS if any(scene.triangles.has_texcoord) else _NUM_ROWS_WITHOUT_TEXCOORD
-    return materialize(_look_up(scene.triangles.surface[:count], hits.face), zero)
+    return materialize(_look_up(scene.triangles.surface, hits.face), zero)
 
 
 def _texture_tint(
@@ -129,7 +125,7 @@ def _texture_tint(
         return None
     size, point = local
     texcoord = None
-    if faces is not None and len(faces) == _NUM_ROWS:
+    if faces is not None and len(faces) == NUM_ROWS:
         u, v = affine(faces[16:24], point)
         texcoord = (u, v)
     point = materialize(point, zero)

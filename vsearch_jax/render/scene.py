@@ -9,10 +9,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjtGeom, mjtLightType, mjtObj, mjtTexture
+from mujoco import mjtGeom, mjtObj, mjtTexture
 
+from vsearch_jax.render.errors import RenderError
+from vsearch_jax.render.geometry.coincidence import hidden_geoms
 from vsearch_jax.render.geometry.rays import RAY_FUNCTIONS
 from vsearch_jax.render.geometry.triangles import TRIANGLE_TYPES, Triangles, compile_triangles
+from vsearch_jax.render.lights import Lights, compile_lights
 from vsearch_jax.render.texture.atlas import Textures, compile_textures, rgb_texture
 
 # Defaults of MuJoCo's renderer for a geom without a material (mjv_initGeom).
@@ -26,43 +29,6 @@ _SHININESS_SCALE, _AMBIENT_WITHOUT_LIGHTS = 128.0, 0.3
 _SHADOW_OFFSET = 1e-4
 
 _LOG = logging.getLogger(__name__)
-
-
-class RenderError(ValueError):
-    """The renderer cannot draw a model or cannot use an argument. The message names the cause and the remedy."""
-
-
-@flax.struct.dataclass
-class Lights:
-    """The L active lights of a model.
-
-    Positions and directions are in the frame of the body that carries the light.
-
-    Attributes:
-      position: f32[L, 3] m, positions of the lights; not used by directional lights.
-      direction: f32[L, 3], unit vector along which the light shines.
-      ambient: f32[L, 3], light that does not depend on the angle of incidence.
-      diffuse: f32[L, 3], light that falls off with the cosine of the angle of incidence.
-      specular: f32[L, 3], light of the highlights.
-      attenuation: f32[L, 3], constant, linear (1/m) and quadratic (1/m^2) term; not used by directional lights.
-      cutoff: f32[L] rad, half angle of the cone of a spot light; pi for a point light.
-      exponent: f32[L], power of the cosine with which a spot light decreases off its axis; 0 for a point light.
-      is_directional: for each light, whether its rays are parallel; static.
-      is_shadowing: for each light, whether it casts shadows; static.
-      bodies: for each light, id of the body that carries it, 0 for a light fixed in the world; static.
-    """
-
-    position: Array
-    direction: Array
-    ambient: Array
-    diffuse: Array
-    specular: Array
-    attenuation: Array
-    cutoff: Array
-    exponent: Array
-    is_directional: tuple[bool, ...] = flax.struct.field(pytree_node=False)
-    is_shadowing: tuple[bool, ...] = flax.struct.field(pytree_node=False)
-    bodies: tuple[int, ...] = flax.struct.field(pytree_node=False)
 
 
 @flax.struct.dataclass
@@ -115,13 +81,21 @@ class RenderScene:
         """Number of visible geoms that are not made of triangles. Their rows come first in the scene's arrays."""
         return sum(kind not in TRIANGLE_TYPES for kind in self.geom_types)
 
+    @property
+    def shadow_casters(self) -> tuple[int, ...]:
+        """Rows of the lights that cast shadows."""
+        return tuple(
+            row for row, is_shadowing in enumerate(self.lights.is_shadowing) if is_shadowing and self.has_shadows
+        )
+
 
 def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1, 2)) -> RenderScene:
     """Compiles the visible geoms, the materials and the lights of a model for `render`.
 
     A geom is invisible if its colour has alpha 0 or its group is not in `geom_groups`. Any other alpha is drawn as 1,
     with a warning in the log. The alpha of textures is ignored. Of a material's textures only the colour texture is
-    drawn. Of several skyboxes the first is drawn.
+    drawn. Of several skyboxes the first is drawn. Of geoms of one shape in one place, such as a visual and a collision
+    geom, the one of the higher group is drawn, then the one of the higher id.
 
     Args:
       mj_model: the compiled MuJoCo model.
@@ -131,15 +105,15 @@ def compile_scene(mj_model: mujoco.MjModel, geom_groups: tuple[int, ...] = (0, 1
       The scene that `render` draws.
 
     Raises:
-      RenderError: no geom is visible; a visible geom has a type or a texture that is not supported; a light tracks a
-        body or is an image light; or a skin or flex is visible.
+      RenderError: no geom is visible; a visible geom has a type or a texture that is not supported; a light is an image
+        light; or a skin or flex is visible.
     """
     rgba = _effective_rgba(mj_model)
     ids = _visible_geoms(mj_model, geom_groups, rgba[:, 3])
     _check_skins_and_flexes(mj_model, geom_groups)
     for sky in np.flatnonzero(mj_model.tex_type == mjtTexture.mjTEXTURE_SKYBOX)[:1]:
         _check_texture(mj_model, int(sky), "the sky")
-    lights = _compile_lights(mj_model)
+    lights = compile_lights(mj_model)
     headlight = mj_model.vis.headlight
     is_headlight_on = float(headlight.active > 0)
     is_without_light = not headlight.active and not lights.is_directional
@@ -173,6 +147,7 @@ def _visible_geoms(model: mujoco.MjModel, geom_groups: tuple[int, ...], alpha: n
         )
     for geom in visible:
         _check_geom(model, int(geom))
+    visible = np.setdiff1d(visible, hidden_geoms(model, visible, alpha))
     transparent = [model.geom(g).name or f"number {g}" for g in visible.tolist() if alpha[g] < 1.0]
     if transparent:
         _LOG.warning("these geoms have an alpha below 1 but are drawn opaque: %s", ", ".join(transparent))
@@ -231,40 +206,3 @@ def _check_skins_and_flexes(model: mujoco.MjModel, groups: tuple[int, ...]) -> N
                     f"{noun} {name!r} (number {number}) cannot be rendered; replace it by a mesh, give it alpha 0, or "
                     f"put it in a group other than {groups}"
                 )
-
-
-def _compile_lights(model: mujoco.MjModel) -> Lights:
-    """Returns the active lights; a light on a body that is welded to the world counts as fixed in the world."""
-    active = np.flatnonzero(model.light_active)
-    for light in active:
-        _check_light(model, int(light))
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_camlight(model, data)
-    bodies = np.where(model.body_weldid[model.light_bodyid[active]] == 0, 0, model.light_bodyid[active])
-    is_point = model.light_type[active] == mjtLightType.mjLIGHT_POINT
-    return Lights(
-        position=_f32(np.where(bodies[:, None] > 0, model.light_pos[active], data.light_xpos[active])),
-        direction=_f32(np.where(bodies[:, None] > 0, model.light_dir[active], data.light_xdir[active])),
-        ambient=_f32(model.light_ambient[active]),
-        diffuse=_f32(model.light_diffuse[active]),
-        specular=_f32(model.light_specular[active]),
-        attenuation=_f32(model.light_attenuation[active]),
-        cutoff=_f32(np.where(is_point, np.pi, np.deg2rad(model.light_cutoff[active]))),
-        exponent=_f32(np.where(is_point, 0.0, model.light_exponent[active])),
-        is_directional=tuple(bool(t == mjtLightType.mjLIGHT_DIRECTIONAL) for t in model.light_type[active]),
-        is_shadowing=tuple(bool(c) for c in model.light_castshadow[active]),
-        bodies=tuple(int(b) for b in bodies),
-    )
-
-
-def _check_light(model: mujoco.MjModel, light: int) -> None:
-    name = f"light {model.light(light).name!r} (number {light})"
-    if model.light_type[light] == mjtLightType.mjLIGHT_IMAGE:
-        raise RenderError(
-            f"{name} is an image light, which cannot be rendered; use the type directional, spot or point"
-        )
-    if model.light_mode[light] != mujoco.mjtCamLight.mjCAMLIGHT_FIXED:
-        mode = mujoco.mjtCamLight(model.light_mode[light]).name
-        raise RenderError(f"{name} has the mode {mode}, which cannot be rendered; use the mode fixed, in any body")

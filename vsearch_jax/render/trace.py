@@ -48,7 +48,7 @@ class Hits(NamedTuple):
       depth: f32[H, W] m along the optical axis; 1 on a miss. `nearest_primitives` returns rough depths: their low bits
         hold the row of the geom.
       is_hit: bool[H, W], whether the pixel shows a geom.
-      face: i32[H, W], number of the face, if the geom is made of triangles; 0 otherwise.
+      face: i32[H, W], column of the face in `Triangles.surface`, if the geom is made of triangles; 0 otherwise.
     """
 
     slot: Array
@@ -194,11 +194,14 @@ def merge_raster(scene: RenderScene, hits: Hits, raster: Raster) -> Hits:
     assert scene.triangles is not None
     is_nearer = raster.depth < jnp.where(hits.is_hit, hits.depth, jnp.inf)
     geom = scene.triangles.geom.at[raster.face].get(mode="promise_in_bounds")
+    face = raster.face
+    if scene.triangles.is_shared:
+        face = face + scene.triangles.shift.at[geom].get(mode="promise_in_bounds")
     return Hits(
         jnp.where(is_nearer, scene.num_primitives + geom, hits.slot),
         jnp.where(is_nearer, raster.depth, hits.depth),
         hits.is_hit | is_nearer,
-        jnp.where(is_nearer, raster.face, 0),
+        jnp.where(is_nearer, face, 0),
     )
 
 

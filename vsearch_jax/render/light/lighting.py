@@ -1,4 +1,4 @@
-"""The lights of a scene at each pixel: poses in the camera's frame, shadows, and the terms of the light model.
+"""The lights of a scene at each pixel: shadows, and the terms of the light model.
 
 Shadows have two sources. Shadows of primitives come from exact shadow rays (`render.trace.is_lit`). Shadows of meshes
 and height fields come from shadow maps (`render.light.shadow_map`). A pixel is lit if both say so. Shadows have no
@@ -7,8 +7,6 @@ derivative.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -16,49 +14,9 @@ from jax import Array
 from vsearch_jax.render import trace
 from vsearch_jax.render.light import shading, shadow_map
 from vsearch_jax.render.light.shadow_map import ShadowMap
-from vsearch_jax.render.mj_poses import GeomPoses
+from vsearch_jax.render.lights import LightPoses
 from vsearch_jax.render.scene import RenderScene
-from vsearch_jax.types import Camera
 from vsearch_jax.xla.vectors import Vector
-
-
-class LightPoses(NamedTuple):
-    """Poses of the L lights of a scene in the camera's frame.
-
-    Attributes:
-      position: f32[L, 3] m, positions of the lights.
-      direction: f32[L, 3], unit vectors along which the lights shine.
-    """
-
-    position: Array
-    direction: Array
-
-
-def light_poses(scene: RenderScene, data: GeomPoses, camera: Camera) -> LightPoses:
-    """Returns the positions and directions of the scene's lights in the camera's frame.
-
-    Args:
-      scene: the compiled scene. Each light is fixed in the world or on a body.
-      data: poses of the bodies in world. Only `xpos` and `xmat` are read, and only if a body carries a light.
-      camera: the camera in the world frame.
-    """
-    positions, directions = [], []
-    for index, body in enumerate(scene.lights.bodies):
-        position, direction = scene.lights.position[index], scene.lights.direction[index]
-        if body:
-            rotation = jnp.asarray(data.xmat[body], dtype=jnp.float32).reshape(3, 3)
-            body_position = jnp.asarray(data.xpos[body], dtype=jnp.float32)
-            position, direction = rotation @ position + body_position, rotation @ direction
-        positions.append(camera.rotation.T @ (position - camera.position))
-        directions.append(camera.rotation.T @ direction)
-    if not positions:
-        return LightPoses(jnp.zeros((0, 3), jnp.float32), jnp.zeros((0, 3), jnp.float32))
-    return LightPoses(jnp.stack(positions), jnp.stack(directions))
-
-
-def _shadow_casters(scene: RenderScene) -> list[int]:
-    """Returns the rows of the lights that cast shadows."""
-    return [i for i, casts in enumerate(scene.lights.is_shadowing) if casts and scene.has_shadows]
 
 
 def _light_source(scene: RenderScene, poses: LightPoses, index: int) -> tuple[Array, bool]:
@@ -69,7 +27,7 @@ def _light_source(scene: RenderScene, poses: LightPoses, index: int) -> tuple[Ar
 
 def needs_shadow_maps(scene: RenderScene) -> bool:
     """Returns whether a shadow map is needed: the scene has meshes or height fields, and a light that casts shadows."""
-    return scene.triangles is not None and bool(_shadow_casters(scene))
+    return scene.triangles is not None and bool(scene.shadow_casters)
 
 
 def shadow_maps(
@@ -89,7 +47,7 @@ def shadow_maps(
     """
     return {
         i: shadow_map.draw_shadow_map(scene, frames, seen, _light_source(scene, poses, i), zero)
-        for i in _shadow_casters(scene)
+        for i in scene.shadow_casters
     }
 
 
@@ -116,7 +74,7 @@ def lit_by(
     """
     poses, maps = jax.lax.stop_gradient(lights)
     lit = {}
-    for index in _shadow_casters(scene):
+    for index in scene.shadow_casters:
         source, is_directional = _light_source(scene, poses, index)
         fixed = jax.lax.stop_gradient((scene, frames, hits, rays, source))
         lit[index] = trace.is_lit(*fixed, is_directional)

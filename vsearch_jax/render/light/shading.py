@@ -14,7 +14,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from vsearch_jax.render.scene import Lights, RenderScene
+from vsearch_jax.render.lights import Lights
+from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.xla.vectors import Vector, dot
 
 # Lower bound of squared lengths, so that the gradients of their roots are finite.
@@ -111,6 +112,9 @@ def positional_incidence(
 def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> list[Array]:
     """Computes the colour of each pixel of an H x W image from its surface and the lights that fall on it.
 
+    MuJoCo draws the lights without shadows in one pass, and adds a pass for each light that casts shadows. OpenGL
+    clamps the light of each pass to [0, 1] and multiplies it by the texture.
+
     Args:
       scene: the compiled scene. The colours of the lights are read.
       surface: the surface that each pixel shows.
@@ -119,15 +123,34 @@ def shade(scene: RenderScene, surface: Surface, incidences: list[Incidence]) -> 
     Returns:
       Red, green and blue, f32[H, W] in [0, 1] each.
     """
-    lights = scene.lights
-    colours = [(lights.ambient[i], lights.diffuse[i], lights.specular[i]) for i in range(len(lights.is_directional))]
-    colours.append((scene.headlight_ambient, scene.headlight_diffuse, scene.headlight_specular))
+    if surface.tint is None:  # the light of all passes together is clamped, too
+        return [_lit_channel(scene, surface, incidences, i, None) for i in range(3)]
+    casters = scene.shadow_casters
+    first = [light for light in range(len(incidences)) if light not in casters]
     channels = []
-    for i in range(3):
-        base, highlight = surface.emission + scene.ambient[i], 0.0
-        for (ambient, diffuse, specular), light in zip(colours, incidences, strict=True):
-            base += light.strength * (ambient[i] + diffuse[i] * light.diffuse)
-            highlight += light.strength * specular[i] * light.specular
-        lit = jnp.clip(surface.rgb[i] * base + surface.specular * highlight, 0.0, 1.0)
-        channels.append(lit if surface.tint is None else lit * surface.tint[i])
+    for i, tint in enumerate(surface.tint):
+        total = tint * _lit_channel(scene, surface, incidences, i, first)
+        for light in casters:
+            total += tint * _lit_channel(scene, surface, incidences, i, [light])
+        channels.append(jnp.minimum(total, 1.0) if casters else total)
     return channels
+
+
+def _lit_channel(
+    scene: RenderScene, surface: Surface, incidences: list[Incidence], channel: int, subset: list[int] | None
+) -> Array:
+    """Returns one channel of the colour, f32[H, W], by one pass over the lights of `subset`; None is all lights.
+
+    Emission and light without a source belong to the pass of the headlight.
+    """
+    lights, headlight = scene.lights, len(incidences) - 1
+    colours = [(lights.ambient[i], lights.diffuse[i], lights.specular[i]) for i in range(headlight)]
+    colours.append((scene.headlight_ambient, scene.headlight_diffuse, scene.headlight_specular))
+    subset = list(range(len(incidences))) if subset is None else subset
+    base = surface.emission + scene.ambient[channel] if headlight in subset else jnp.zeros_like(surface.emission)
+    highlight = 0.0
+    for index in subset:
+        (ambient, diffuse, specular), light = colours[index], incidences[index]
+        base += light.strength * (ambient[channel] + diffuse[channel] * light.diffuse)
+        highlight += light.strength * specular[channel] * light.specular
+    return jnp.clip(surface.rgb[channel] * base + surface.specular * highlight, 0.0, 1.0)

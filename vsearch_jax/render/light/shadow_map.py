@@ -22,7 +22,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.render import trace
-from vsearch_jax.render.geometry.rasterizer import Pinhole, Projection, rasterize
+from vsearch_jax.render.geometry.projection import Pinhole, Projection
+from vsearch_jax.render.geometry.rasterizer import rasterize
 from vsearch_jax.render.geometry.triangles import Triangles
 from vsearch_jax.render.scene import RenderScene
 from vsearch_jax.xla.vectors import Vector, dot

@@ -112,24 +112,47 @@ def _side_height(model: mujoco.MjModel, texture: int) -> int:
 
 
 def _sides(model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """Returns f64[1 or 6, h, w, 3] in [0, 255]: one image, or a cube map's right, left, up, down, front and back."""
+    """Returns [1 or 6, h, w, 3] in [0, 255]: one image, or a cube map's right, left, up, down, front and back.
+
+    The values are linear: u8, or f32 for a 2D texture in sRGB, which OpenGL decodes. It does not decode cube maps.
+    """
     width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
     channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
     image = model.tex_data[first : first + width * height * channels].reshape(height, width, channels)[..., :3]
     if model.tex_type[texture] == mjtTexture.mjTEXTURE_2D:
-        return image[None].astype(np.float64)
-    sides = image[None].repeat(6, axis=0) if width == height else image.reshape(6, width, width, 3)
-    return sides.astype(np.float64)
+        is_srgb = model.tex_colorspace[texture] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB
+        return _decoded_srgb()[image][None] if is_srgb else image[None]
+    return image[None].repeat(6, axis=0) if width == height else image.reshape(6, width, width, 3)
+
+
+def _decoded_srgb() -> np.ndarray:
+    """Returns f32[256] in [0, 255], the linear value of each sRGB byte (IEC 61966-2-1)."""
+    value = np.arange(256) / 255.0
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return (255.0 * linear).astype(np.float32)
 
 
 def _next_level(sides: np.ndarray) -> np.ndarray:
-    """Returns the next mipmap level: the means of 2 x 2 texels. An odd last row or column is left out."""
-    for axis in (1, 2):
-        count = sides.shape[axis]
-        if count > 1:
-            even, odd = (np.take(sides, range(i, count // 2 * 2, 2), axis=axis) for i in (0, 1))
-            sides = 0.5 * (even + odd)
-    return sides
+    """Returns the next mipmap level, f32[sides, h, w, 3]: means over areas, so that the mean of the image stays.
+
+    An even axis takes the means of two texels. On an odd axis of 2 m + 1 texels, each of the m new texels is the mean
+    of an interval of 2 + 1 / m old ones.
+    """
+    return _halve(_halve(sides.astype(np.float32, copy=False), 1), 2)
+
+
+def _halve(sides: np.ndarray, axis: int) -> np.ndarray:
+    rows = np.moveaxis(sides, axis, 0)
+    half = len(rows) // 2
+    if half == 0:
+        return sides
+    if len(rows) % 2 == 0:
+        result = 0.5 * (rows[0::2] + rows[1::2])
+    else:
+        weight = np.arange(1, half + 1, dtype=np.float32)[:, None, None, None] / len(rows)
+        middle = np.float32(half / len(rows))
+        result = weight[::-1] * rows[0:-1:2] + middle * rows[1::2] + weight * rows[2::2]
+    return np.moveaxis(result, 0, axis)
 
 
 def _pack_texels(textures: list[np.ndarray], num_levels: int) -> tuple[np.ndarray, np.ndarray]:
@@ -138,8 +161,10 @@ def _pack_texels(textures: list[np.ndarray], num_levels: int) -> tuple[np.ndarra
     for index, level_0 in enumerate(textures):
         sides = level_0
         for level in range(num_levels):
-            rounded = np.round(sides).astype(np.int64)
-            packed = rounded[..., 0] | rounded[..., 1] << 8 | rounded[..., 2] << 16
+            rounded = sides if sides.dtype == np.uint8 else np.round(sides).astype(np.uint8)
+            packed = np.zeros(rounded.shape[:3], np.int32)
+            for channel in range(3):
+                packed |= rounded[..., channel].astype(np.int32) << 8 * channel
             for side in range(6):
                 start[index, side, level] = count + (side % len(sides)) * packed[0].size
             texels.append(packed.reshape(-1))
@@ -168,7 +193,8 @@ def _mapping(model: mujoco.MjModel, geom: int) -> _Mapping:
     if model.tex_type[texture] != mjtTexture.mjTEXTURE_2D:
         # MuJoCo draws primitives as scaled unit solids, but planes, meshes and height fields in metres.
         is_scaled = kind not in (*TRIANGLE_TYPES, int(mjtGeom.mjGEOM_PLANE))
-        extent = np.where(is_scaled, half_sizes, 1.0) / (half_sizes if is_uniform else 1.0)
+        with np.errstate(divide="ignore"):  # along an endless axis, of size 0, OpenGL's direction does not change
+            extent = np.where(is_scaled, half_sizes, 1.0) / (half_sizes if is_uniform else 1.0)
         return _Mapping(CUBE, np.ones(2), np.zeros(2), extent)
     stretch = np.where((half_sizes[:2] > 0.0) & is_uniform, half_sizes[:2], 1.0)
     has_texcoord = kind == mjtGeom.mjGEOM_MESH and model.mesh_texcoordadr[model.geom_dataid[geom]] >= 0
