@@ -95,7 +95,7 @@ def test_nothing_touches_between_samples_that_prove_it(problems, part):
         motion = jnp.zeros_like(start).at[:7].set(step * change)
         ends = of_part(evaluate_sample(arm, start)), of_part(evaluate_sample(arm, start + motion))
         bounds = edge_bounds(pairs, change)
-        is_proven = is_free_between(pairs, ends, step, bounds, displacements(ends[0].axes, ends[1].axes)[0])
+        is_proven = is_free_between(pairs, ends, step, bounds, displacements(pairs, *ends)[0])
         by_levers = jnp.all(ends[0].gap + ends[1].gap >= bounds.rate * step)
         between = jax.vmap(lambda place: jnp.min(of_part(evaluate_sample(arm, start + place * motion)).gap))(places)
         is_proven = is_proven & (jnp.minimum(between[0], between[-1]) > 0.0)
