@@ -18,7 +18,7 @@ from vsearch_jax.env import motion as motions
 from vsearch_jax.env.episode import check_band, episode_of
 from vsearch_jax.geometry import view_from_uniform
 from vsearch_jax.planning import Motion, Trajectory, nearest_cell, reachability_map, solve_view
-from vsearch_jax.planning.execution import check_drive
+from vsearch_jax.planning.drive import check_drive
 from vsearch_jax.robot.arm import build_arm, camera_pose, forward_kinematics
 from vsearch_jax.scene import SceneError, build_scene
 from vsearch_jax.types import Camera, EncoderState, Image, Observation, ReachabilityMap, View

@@ -98,13 +98,13 @@ def _method(model: mujoco.MjModel, geoms: Geoms, capsule_geoms: set[int], a: int
     if b in capsule_geoms:
         return "capsules"
     kind = int(model.geom_type[b])
-    if model.body_weldid[model.geom_bodyid[b]] != 0 or (kind == MESH and b not in geoms.object):
+    if b in geoms.arm or (kind == MESH and b not in geoms.object):
         return None
     return {CYLINDER: "cylinders", ELLIPSOID: "ellipsoids"}.get(kind, "boxes")
 
 
 def _size_class(model: mujoco.MjModel, geoms: Geoms, a: int, b: int) -> tuple[int, int, int]:
-    """Returns how many vertices each solid has (0 few, 1 more, 2 many), and 1 if one of them is curved, else 0.
+    """Returns how many vertices each solid has (0 few, 1 more, 2 many; sorted), and 1 if one is curved, else 0.
 
     In a group all solids take as much time as the largest one.
     """
@@ -116,4 +116,5 @@ def _size_class(model: mujoco.MjModel, geoms: Geoms, a: int, b: int) -> tuple[in
         return int(num_vertices > BLOCK) + int(num_vertices > 16 * BLOCK)
 
     is_curved = any(int(model.geom_type[g]) in (CYLINDER, ELLIPSOID) for g in (a, b))
-    return size(a), size(b), int(is_curved)
+    smaller, larger = sorted((size(a), size(b)))
+    return smaller, larger, int(is_curved)

@@ -61,8 +61,8 @@ class ConvexPairs:
     """P pairs of convex solids.
 
     Attributes:
-      first: i32[P], row of the first geom in `Pairs.bodies`.
-      second: i32[P], row of the second geom in `Pairs.bodies`; the table's pairs have none.
+      first: i32[P], row in `Pairs.bodies` of the geom with more vertices.
+      second: i32[P], row in `Pairs.bodies` of the other geom; the table's pairs have none.
       first_side: Side of the first geoms.
       second_side: Side of the second geoms; None for the table's pairs.
     """
@@ -90,9 +90,9 @@ class Pairs:
       table: i32[M], rows of the M capsules that must stay above the table.
       first: i32[P], row of the first capsule of each of P pairs of capsules.
       second: i32[P], row of the second capsule of each of P pairs of capsules.
-      boxes: pairs of a capsule and a fixed box. An object's mesh and a height field count as their bounding boxes.
-      cylinders: pairs of a capsule and a fixed cylinder.
-      ellipsoids: pairs of a capsule and a fixed ellipsoid.
+      boxes: pairs of a capsule and a box of mount, object or obstacles. An object's mesh and a height field count as their bounding boxes.
+      cylinders: pairs of a capsule and a cylinder of mount, object or obstacles.
+      ellipsoids: pairs of a capsule and an ellipsoid of mount, object or obstacles.
       bodies: the S geoms of the pairs in `convex`.
       convex: all other pairs, in groups of solids of similar size. Without such pairs it is empty and costs nothing.
       part: i32[N], what the arm would touch: TABLE, OBJECT, SELF (the mount included) or OBSTACLE.
@@ -251,13 +251,19 @@ def _build_convex(
     """Returns the groups of pairs of convex solids. An object's mesh counts as its bounding box."""
     solids = {geom: convex_solid(model, geom, is_box=geom in geoms.object) for geom in groups.body_geoms}
 
+    def num_points(geom: int | None) -> int:
+        return 0 if geom is None else len(solids[geom].points)
+
     def build(pairs: Sequence[tuple[int, int | None]]) -> ConvexPairs:
-        others = [b for _, b in pairs if b is not None]
+        # The larger solid comes first, so that each side is padded as little as possible.
+        by_size = [sorted(pair, key=num_points, reverse=True) for pair in pairs]
+        larger = [first for first, _ in by_size if first is not None]
+        smaller = [second for _, second in by_size if second is not None]
         return ConvexPairs(
-            first=jnp.asarray([body_row[a] for a, _ in pairs], jnp.int32),
-            second=jnp.asarray([body_row[b] for b in others], jnp.int32),
-            first_side=build_side([solids[a] for a, _ in pairs]),
-            second_side=build_side([solids[b] for b in others]) if others else None,
+            first=jnp.asarray([body_row[g] for g in larger], jnp.int32),
+            second=jnp.asarray([body_row[g] for g in smaller], jnp.int32),
+            first_side=build_side([solids[g] for g in larger]),
+            second_side=build_side([solids[g] for g in smaller]) if smaller else None,
         )
 
     return tuple(build(pairs) for pairs in groups.convex)
