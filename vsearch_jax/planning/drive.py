@@ -50,8 +50,8 @@ def check_drive(scene: Scene, arm: Arm) -> None:
         if fault:
             raise SceneError(
                 f"actuator {model.actuator(actuator).name!r} (number {actuator}) acts on a joint that moves the "
-                f"camera, but it {fault}; replace it by <position joint=... kp=... kv=.../>, or set EnvConfig.motion to "
-                "'kinematic'"
+                f"camera, but it {fault}; replace it by <position joint=... kp=... kv=.../>, or set EnvConfig.motion "
+                "to 'kinematic'"
             )
     gain = model.actuator_gainprm[:, 0]
     is_position = (gain > 0.0) & np.isclose(model.actuator_biasprm[:, 1], -gain) & (model.actuator_biastype == _AFFINE)

@@ -90,7 +90,8 @@ class Pairs:
       table: i32[M], rows of the M capsules that must stay above the table.
       first: i32[P], row of the first capsule of each of P pairs of capsules.
       second: i32[P], row of the second capsule of each of P pairs of capsules.
-      boxes: pairs of a capsule and a box of mount, object or obstacles. An object's mesh and a height field count as their bounding boxes.
+      boxes: pairs of a capsule and a box of mount, object or obstacles. An object's mesh and a height field count as
+        their bounding boxes.
       cylinders: pairs of a capsule and a cylinder of mount, object or obstacles.
       ellipsoids: pairs of a capsule and an ellipsoid of mount, object or obstacles.
       bodies: the S geoms of the pairs in `convex`.
