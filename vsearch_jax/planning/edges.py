@@ -182,7 +182,7 @@ def edge_is_free(arm: Arm, start: Array, end: Array, config: PlanningConfig) -> 
 
     True is a proof: no contact can be missed between samples. False means that there is a contact, or that the path
     leads closer to something that is already nearer than `config.resolution`; then the proof is given up. A path may
-    start and end that close. Ellipsoids count as the capsules around them (see `robot.collision.build_pairs`).
+    start and end that close. Ellipsoids around the arm count as capsules (see `robot.collision.build_pairs`).
 
     Under `vmap` every edge waits for the slowest. For many edges `rrt_connect` is faster.
 

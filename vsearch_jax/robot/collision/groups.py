@@ -7,8 +7,8 @@ from typing import NamedTuple
 import mujoco
 
 from vsearch_jax.robot.collision.candidates import Geoms, table_geoms, touching_pairs
-from vsearch_jax.robot.collision.convex import BLOCK
 from vsearch_jax.robot.collision.solids import CAPSULE, CYLINDER, ELLIPSOID, MESH, SPHERE, hull_vertices
+from vsearch_jax.robot.collision.support import BLOCK
 
 
 class PairGroups(NamedTuple):

@@ -13,10 +13,10 @@ import numpy as np
 from jax import Array
 
 from vsearch_jax.robot.collision.candidates import Geoms
-from vsearch_jax.robot.collision.convex import Side
 from vsearch_jax.robot.collision.groups import PairGroups, group_pairs
 from vsearch_jax.robot.collision.motion_bounds import lever_arms
 from vsearch_jax.robot.collision.solids import CYLINDER, ELLIPSOID, SPHERE, build_side, convex_solid
+from vsearch_jax.robot.collision.support import Side
 from vsearch_jax.robot.kinematics import Placement, build_placement, rotate
 
 TABLE, OBJECT, SELF, OBSTACLE = range(4)

@@ -18,7 +18,7 @@ import trimesh
 from jax import Array
 from scipy.spatial import ConvexHull
 
-from vsearch_jax.robot.collision.convex import BLOCK, Side
+from vsearch_jax.robot.collision.support import BLOCK, Side
 
 SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
@@ -100,13 +100,23 @@ def convex_solid(model: mujoco.MjModel, geom: int, is_box: bool = False) -> Soli
 
 
 def box_corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Returns f64[8, 3] m, the corners of the geom's bounding box in the frame of the geom."""
+    """Returns f64[8, 3] m, the corners of a geom's bounding box in the frame of the geom.
+
+    Args:
+      model: the compiled model.
+      geom: MuJoCo's number of the geom, which is no plane.
+    """
     center, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
     return center + half_sizes * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def hull_vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray:
-    """Returns f64[V, 3] m, vertices of the convex hull that MuJoCo collides."""
+    """Returns f64[V, 3] m, vertices of the convex hull that MuJoCo collides, in the frame of the geoms of a mesh.
+
+    Args:
+      model: the compiled model.
+      mesh: MuJoCo's number of the mesh.
+    """
     start, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     vertices = model.mesh_vert[start : start + count].astype(float)
     address = int(model.mesh_graphadr[mesh])
