@@ -25,7 +25,7 @@ from vsearch_jax.xla.batching import append_axes
 from vsearch_jax.xla.materialize import materialize, runtime_zero
 from vsearch_jax.xla.vectors import Vector, dot
 
-# Iterations on the coarse hulls, and then on the whole ones. With 60 random configurations of the Panda and of the xArm7
+# Iterations on the coarse hulls, and then on the whole ones. On 60 random configurations of the Panda and of the xArm7
 # the result is at most 0.17 mm too small. Curved solids need more.
 COARSE_ITERATIONS, ITERATIONS, ROUND_ITERATIONS = 8, 6, 16
 # m. Subtracted from each distance, because positions in float32 have an error.
