@@ -144,10 +144,10 @@ def _joint_lengths(model: mjx.Model, qpos: Array, velocity: Array, held: Array) 
     """Returns the lengths and velocities f32[nu] of all actuators; only those of joints move."""
     is_joint = np.isin(model.actuator_trntype, _JOINT)
     joint = np.where(is_joint, model.actuator_trnid[:, 0], 0)
-    gear = model.actuator_gear[:, 0]
-    moves = jnp.asarray(is_joint)
-    length = jnp.where(moves, gear * qpos[np.asarray(model.jnt_qposadr)[joint]], held)
-    return length, jnp.where(moves, gear * velocity[np.asarray(model.jnt_dofadr)[joint]], 0.0)
+    gear, moves = model.actuator_gear[:, 0], jnp.asarray(is_joint)
+    planned: Array = gear * qpos[np.asarray(model.jnt_qposadr)[joint]]
+    speed: Array = gear * velocity[np.asarray(model.jnt_dofadr)[joint]]
+    return jnp.where(moves, planned, held), jnp.where(moves, speed, 0.0)
 
 
 def _force_free_controls(model: mjx.Model, length: Array, velocity: Array) -> Array:
@@ -156,4 +156,5 @@ def _force_free_controls(model: mjx.Model, length: Array, velocity: Array) -> Ar
     is_affine = (model.actuator_biastype == _AFFINE) & (model.actuator_gaintype == _FIXED_GAIN)
     force = bias[:, 0] + bias[:, 1] * length + bias[:, 2] * velocity
     is_linear = jnp.asarray(is_affine) & (jnp.abs(gain) > 0.0)
-    return jnp.where(is_linear, -force / jnp.where(is_linear, gain, 1.0), 0.0)
+    controls: Array = -force / jnp.where(is_linear, gain, 1.0)
+    return jnp.where(is_linear, controls, 0.0)

@@ -154,8 +154,8 @@ def _equivalent_goals(arm: Arm, start: Array, goal: Array) -> tuple[Array, Array
     shifts = jnp.concatenate([jnp.diag(turns), -jnp.diag(turns)])
     candidates = goal[None] + shifts
     is_inside = (candidates >= arm.lower[address][None]) & (candidates <= arm.upper[address][None])
-    is_equivalent = jnp.all(is_inside, axis=1) & jnp.any(shifts != 0.0, axis=1)
-    travel = jnp.linalg.norm(candidates - start[None], axis=1)
+    is_equivalent: Array = jnp.all(is_inside, axis=1) & jnp.any(shifts != 0.0, axis=1)
+    travel: Array = jnp.linalg.norm(candidates - start[None], axis=1)
     nearest = jnp.argsort(jnp.where(is_equivalent, travel, jnp.inf))[:NUM_EQUIVALENTS]
     goals = jnp.concatenate([goal[None], candidates[nearest]])
     return goals, jnp.concatenate([jnp.ones(1, bool), is_equivalent[nearest]])
