@@ -41,6 +41,9 @@ def _write_arm(robots: Path, name: str, excludes: list[tuple[str, str]]) -> Path
     hand = spec.body("right_hand")
     hand.add_site(name="tcp", pos=[0.0, 0.0, 0.1])
     hand.add_camera(name="wrist", pos=[0.05, 0.0, 0.05], quat=[0.0, 1.0, 0.0, 0.0])
+    for joint in spec.joints:
+        if not any(joint.range):  # Continuous joints; planning needs limits.
+            joint.range, joint.limited = [-3.14, 3.14], True
     for first, second in excludes:
         spec.add_exclude(bodyname1=first, bodyname2=second)
     spec.compile()
