@@ -1,5 +1,7 @@
 """Edges and the proofs behind them, compared with C MuJoCo and with dense samples."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -50,6 +52,21 @@ def _capsule_ends(axes) -> np.ndarray:
     return np.stack([center - half_axis, center + half_axis])
 
 
+def _body_corners(arm, frames) -> np.ndarray:
+    """The corners of the bodies' bounding boxes, [8, configurations, bodies, 3] m."""
+    position = np.stack(frames.position, axis=-1)
+    rotation = np.stack([np.stack(row, axis=-1) for row in frames.rotation], axis=-2)
+    center, size = np.asarray(arm.planning_pairs.bodies.box_center), np.asarray(arm.planning_pairs.bodies.box_size)
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    corners = center + signs[:, None] * size
+    return position + np.einsum("nbij,cbj->cnbi", rotation, corners)
+
+
+def _largest_second_differences(points: np.ndarray) -> np.ndarray:
+    second = np.linalg.norm(points[:, 2:] - 2.0 * points[:, 1:-1] + points[:, :-2], axis=-1)
+    return second.max(axis=(0, 1), initial=0.0)
+
+
 @pytest.fixture(scope="module", params=["lwr", "second"])
 def any_arm(request, problems, tmp_path_factory):
     """The LWR, and an arm with a slide and a side branch."""
@@ -63,15 +80,16 @@ def any_arm(request, problems, tmp_path_factory):
 def test_bends_bound_the_second_derivatives_along_an_edge(any_arm):
     arm, places = any_arm, np.linspace(0.0, 1.0, 33, dtype=np.float32)
     random, address = np.random.default_rng(3), np.asarray(any_arm.chain.address)
-    axes_along = jax.jit(jax.vmap(lambda q: evaluate_sample(arm, q).axes))
+    samples_along = jax.jit(jax.vmap(lambda q: evaluate_sample(arm, q)))
     largest = 0.0
     for _ in range(8):
         start, goal = (np.array(arm.home) for _ in range(2))
         for qpos in (start, goal):
             qpos[address] = random.uniform(*(limit[address] for limit in start_limits(arm)))
         change = goal - start
-        ends = _capsule_ends(axes_along((start + places[:, None] * change).astype(np.float32)))
-        second = np.linalg.norm(ends[:, 2:] - 2.0 * ends[:, 1:-1] + ends[:, :-2], axis=-1).max(axis=(0, 1)) * 32.0**2
+        samples = samples_along((start + places[:, None] * change).astype(np.float32))
+        points = (_capsule_ends(samples.axes), _body_corners(arm, samples.frames))
+        second = np.concatenate([_largest_second_differences(p) for p in points]) * 32.0**2
         bend = np.asarray(edge_bounds(arm.planning_pairs, jnp.asarray(change[address], jnp.float32)).bend)
         assert np.all(second <= bend + 2e-3)  # rounding in float32, magnified by 32^2
         largest = max(largest, (second / np.maximum(bend, 1e-3)).max())
@@ -95,7 +113,7 @@ def test_nothing_touches_between_samples_that_prove_it(problems, part):
         motion = jnp.zeros_like(start).at[:7].set(step * change)
         ends = of_part(evaluate_sample(arm, start)), of_part(evaluate_sample(arm, start + motion))
         bounds = edge_bounds(pairs, change)
-        is_proven = is_free_between(pairs, ends, step, bounds, displacements(ends[0].axes, ends[1].axes)[0])
+        is_proven = is_free_between(pairs, ends, step, bounds, displacements(pairs, *ends)[0])
         by_levers = jnp.all(ends[0].gap + ends[1].gap >= bounds.rate * step)
         between = jax.vmap(lambda place: jnp.min(of_part(evaluate_sample(arm, start + place * motion)).gap))(places)
         is_proven = is_proven & (jnp.minimum(between[0], between[-1]) > 0.0)

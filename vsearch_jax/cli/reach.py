@@ -12,7 +12,9 @@ from vsearch_jax import report
 from vsearch_jax.config import Config, ConfigError, SceneConfig
 from vsearch_jax.env import build_parts
 from vsearch_jax.planning.mount_scan import Mount, best_mount, scan_mounts
+from vsearch_jax.robot.blocking import describe_blocking_contacts
 from vsearch_jax.runs.atomic import write_atomically
+from vsearch_jax.scene import build_scene
 
 NUM_AZIMUTHS = 24
 """Azimuths of a reachability map. Between them, what an arm reaches changes little."""
@@ -61,9 +63,10 @@ def draw_reach(
         write_atomically(out / name, report.to_png(figure))
     views = f"views from {band_deg[0]:g} to {band_deg[1]:g} degrees of elevation"
     if best.coverage == 0.0:
+        blocking = describe_blocking_contacts(build_scene(dataclasses.replace(scene, mount_height=best.height)))
         raise ConfigError(
             f"arm {scene.arm!r} reaches none of the {views} around object {scene.object!r} at any mount height from "
-            f"{low:.10g} to {high:.10g} m; {out / 'reachability.png'} shows what it reaches"
+            f"{low:.10g} to {high:.10g} m; {out / 'reachability.png'} shows what it reaches{blocking}"
         )
     is_at_end = best.coverage < 1.0 and len(mounts) > 1 and best.height in (mounts[0].height, mounts[-1].height)
     return _describe(best, views, is_at_end, out)

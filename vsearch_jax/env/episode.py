@@ -23,6 +23,8 @@ from vsearch_jax.geometry import (
     wrap_angle,
 )
 from vsearch_jax.planning import Motion
+from vsearch_jax.robot.blocking import describe_blocking_contacts
+from vsearch_jax.scene import build_scene
 from vsearch_jax.types import Camera, EpisodeState, Observation, ReachabilityMap, View
 from vsearch_jax.xla.tree import tree_where
 
@@ -59,7 +61,8 @@ def check_band(reach: ReachabilityMap, config: Config) -> None:
         raise UnreachableError(
             f"arm {config.scene.arm!r} at SceneConfig.mount_height {config.scene.mount_height:g} reaches no elevation "
             f"at every azimuth around object {config.scene.object!r}; run `vsearch reach`: it draws the views that the "
-            "arm reaches and proposes a mount height (SceneConfig.mount_height)",
+            "arm reaches and proposes a mount height (SceneConfig.mount_height)"
+            f"{describe_blocking_contacts(build_scene(config.scene))}",
             reach,
         )
 

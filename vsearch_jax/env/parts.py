@@ -8,7 +8,7 @@ import jax
 
 from vsearch_jax import render
 from vsearch_jax.config import Config, ConfigError
-from vsearch_jax.planning.execution import check_drive
+from vsearch_jax.planning.drive import check_drive
 from vsearch_jax.robot.arm import Arm, build_arm
 from vsearch_jax.scene import Scene, SceneError, build_scene
 

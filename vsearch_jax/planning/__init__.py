@@ -1,7 +1,8 @@
 """Inverse kinematics, the reachability map, collision-free joint paths, and their timing and execution."""
 
+from vsearch_jax.planning.drive import check_drive
 from vsearch_jax.planning.edges import edge_is_free
-from vsearch_jax.planning.execution import Execution, check_drive, execute, pass_through
+from vsearch_jax.planning.execution import Execution, execute, pass_through
 from vsearch_jax.planning.ik import ik
 from vsearch_jax.planning.mount_scan import Mount, best_mount, coverage, scan_mounts
 from vsearch_jax.planning.reachability import nearest_cell, reachability_map, solve_view

@@ -23,7 +23,7 @@ from vsearch_jax.planning.proofs import (
 )
 from vsearch_jax.robot import collision
 from vsearch_jax.robot.arm import Arm
-from vsearch_jax.robot.collision import Axes
+from vsearch_jax.robot.collision import Axes, Frames
 from vsearch_jax.xla.batching import append_axes, batch_axis_last
 from vsearch_jax.xla.tree import tree_where
 
@@ -38,15 +38,15 @@ PROBES = (1.0, 0.5, 0.25, 0.75, 0.375, 0.625, 0.875, 0.125, 0.0)
 
 
 class Edge(NamedTuple):
-    """A straight joint path and how far it is proven free of contact. N pairs of geoms, C capsules, J chain joints.
+    """A straight joint path and how far it is proven free of contact. C capsules, S bodies, J chain joints.
 
     Attributes:
       start: f32[J] rad or m, joint values at the start.
       change: f32[J] rad or m, joint values at the end less those at the start.
       proven: f32[] in [0, 1], share of the path that is proven free of contact.
       sample: EdgeSample at `proven`. During the probes it is that of the last probe; the last probe is at 0.
-      speed: f32[C] m, distance that each capsule would move on the whole edge at its present speed.
-      sink: f32[C] m, downward part of that distance.
+      speed: f32[C + S] m, distance that each geom would move on the whole edge at its present speed.
+      sink: f32[C + S] m, downward part of that distance.
       num_failures: i32[], steps from `proven` that could not be proven free.
       num_probes: i32[], number of the `PROBES` that are done.
       is_blocked: bool[], a probe is in contact or no step could be proven free.
@@ -72,9 +72,11 @@ def edge_between(arm: Arm, start: Array, end: Array) -> Edge:
       end: f32[J] rad or m, values of these joints at the end of the edge.
     """
     pairs = arm.planning_pairs
-    still = jnp.zeros(pairs.radius.shape[0])
-    sample = EdgeSample(jnp.zeros(pairs.part.shape[0]), Axes((still, still, still), (still, still, still)))
-    zero = jnp.int32(0)
+    none, still = jnp.zeros(pairs.radius.shape[0]), jnp.zeros(pairs.reach.shape[0])
+    at_origin = jnp.zeros(pairs.bodies.geom.shape[0])
+    origin = (at_origin, at_origin, at_origin)
+    axes, frames = Axes((none, none, none), (none, none, none)), Frames(origin, (origin, origin, origin))
+    sample, zero = EdgeSample(jnp.zeros(pairs.part.shape[0]), axes, frames), jnp.int32(0)
     return Edge(start, end - start, jnp.float32(0.0), sample, still, still, zero, zero, jnp.bool_(False))
 
 
@@ -129,7 +131,7 @@ def _take_sample(arm: Arm, qpos: Array, bounds: EdgeBounds, resolution: float, e
     sample = evaluate_sample(arm, qpos.at[arm.chain.address].set(edge.start + place[None] * edge.change))
     is_clear = jnp.all(sample.gap > 0.0, axis=0)
     step = place - edge.proven  # the step after rounding
-    distance, fall = displacements(edge.sample.axes, sample.axes)
+    distance, fall = displacements(pairs, edge.sample, sample)
     is_proven = (
         ~is_probe & (step > 0.0) & is_clear & is_free_between(pairs, (edge.sample, sample), step, bounds, distance)
     )
@@ -180,7 +182,7 @@ def edge_is_free(arm: Arm, start: Array, end: Array, config: PlanningConfig) -> 
 
     True is a proof: no contact can be missed between samples. False means that there is a contact, or that the path
     leads closer to something that is already nearer than `config.resolution`; then the proof is given up. A path may
-    start and end that close. Ellipsoids count as the capsules around them (see `robot.collision.build_pairs`).
+    start and end that close. Ellipsoids around the arm count as capsules (see `robot.collision.build_pairs`).
 
     Under `vmap` every edge waits for the slowest. For many edges `rrt_connect` is faster.
 

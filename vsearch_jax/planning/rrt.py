@@ -21,6 +21,8 @@ from vsearch_jax.xla.batching import flatten_vmap
 from vsearch_jax.xla.tree import tree_where
 
 State = TypeVar("State")
+# Goals that are tried if there is no path to the given one. In each of them one hinge is turned by a full turn.
+NUM_EQUIVALENTS = 2
 
 
 class _Paths(NamedTuple):
@@ -42,7 +44,8 @@ def rrt_connect(arm: Arm, key: Array, start: Array, goal: Array, config: Plannin
 
     The straight joint path is tried first. If it is blocked, two trees grow from start and goal until they meet
     (Kuffner and LaValle 2000), and shortcuts shorten the path through them. The path is proven free of contact for the
-    model's geometry (see `planning.edges`).
+    model's geometry (see `planning.edges`). If no path is found, the same is tried for the two nearest goals in which
+    one hinge is turned by a full turn inside its limits. The path then ends at that goal.
 
     Under `vmap` the problems share a fixed number of lanes: each lane solves one problem after another, so no problem
     waits for the slowest (see `xla.lane_pool` and `planning.lane_counts`). `vmap` over the arm raises
@@ -96,17 +99,9 @@ def _plan_batch(is_bidirectional: bool, config: PlanningConfig, arm: Arm, batch:
     goals = finite.at[:, address].set(problems.goal)
     ends = jnp.concatenate([starts, goals])
     is_start_good, is_goal_good = jnp.split(jax.vmap(functools.partial(_is_good, arm))(ends), 2)
-    is_plannable = is_start_good & is_goal_good
-
-    is_straight = _check_straight(arm, config, problems, is_plannable)
-    is_open = is_plannable & ~is_straight
-    straight = jnp.concatenate(
-        [problems.start[:, None], jnp.repeat(problems.goal[:, None], config.max_waypoints - 1, axis=1)], axis=1
-    )
-    straight_paths = _Paths(straight, jnp.full(keys.shape[0], 2, jnp.int32), is_straight)
-    paths = _grow_trees(arm, config, is_bidirectional, problems, is_open, straight_paths)
+    paths = _find_paths(arm, config, is_bidirectional, problems, is_start_good & is_goal_good)
     to_shorten = PathToShorten(paths.waypoints, paths.num_points, problems.qpos, problems.key)
-    waypoints = _shorten(arm, config, to_shorten, is_open & paths.is_found)
+    waypoints = _shorten(arm, config, to_shorten, paths.is_found & (paths.num_points > 2))
     status = jnp.where(paths.is_found, int(PlanStatus.FOUND), int(PlanStatus.EXHAUSTED))
     status = jnp.where(is_goal_good, status, int(PlanStatus.GOAL_BLOCKED))
     status = jnp.where(is_start_good, status, int(PlanStatus.START_BLOCKED))
@@ -118,6 +113,52 @@ def _plan_batch(is_bidirectional: bool, config: PlanningConfig, arm: Arm, batch:
         length=jnp.where(paths.is_found, length, jnp.inf),
         status=status.astype(jnp.int32),
     )
+
+
+def _find_paths(
+    arm: Arm, config: PlanningConfig, is_bidirectional: bool, problems: PlanningProblem, is_plannable: Array
+) -> _Paths:
+    """Returns straight paths and paths by trees to the goals, or to full-turn equivalents where there are none."""
+    goals, is_inside = jax.vmap(functools.partial(_equivalent_goals, arm))(problems.start, problems.goal)
+    start = jnp.repeat(problems.start[:, None], config.max_waypoints, axis=1)
+    nothing = _Paths(start, jnp.full(start.shape[0], 2, jnp.int32), jnp.zeros(start.shape[0], bool))
+
+    def is_open(index: Array, paths: _Paths) -> Array:
+        return is_plannable & is_inside[:, jnp.minimum(index, NUM_EQUIVALENTS)] & ~paths.is_found
+
+    def attempt(state: tuple[Array, _Paths]) -> tuple[Array, _Paths]:
+        index, paths = state
+        tried, is_tried = problems._replace(goal=goals[:, index]), is_open(index, paths)
+        is_straight = _check_straight(arm, config, tried, is_tried)
+        ends = jnp.repeat(tried.goal[:, None], config.max_waypoints - 1, axis=1)
+        straight = paths._replace(waypoints=jnp.concatenate([start[:, :1], ends], axis=1), is_found=is_straight)
+        paths = jax.tree.map(
+            lambda new, old: jnp.where(is_tried.reshape(-1, *[1] * (new.ndim - 1)), new, old), straight, paths
+        )
+        return index + 1, _grow_trees(arm, config, is_bidirectional, tried, is_tried & ~is_straight, paths)
+
+    # One loop holds all attempts, so its body is compiled once.
+    _, paths = jax.lax.while_loop(
+        lambda state: (state[0] <= NUM_EQUIVALENTS) & jnp.any(is_open(*state)), attempt, (jnp.int32(0), nothing)
+    )
+    return paths
+
+
+def _equivalent_goals(arm: Arm, start: Array, goal: Array) -> tuple[Array, Array]:
+    """Returns the goal and the nearest goals in which one hinge is turned by a full turn, f32[1 + NUM_EQUIVALENTS, J].
+
+    Also returns bool[1 + NUM_EQUIVALENTS], whether each lies inside the limits. The first is the goal itself.
+    """
+    address = arm.chain.address
+    turns = 2.0 * jnp.pi * jnp.where(arm.chain.is_slide, 0.0, 1.0)
+    shifts = jnp.concatenate([jnp.diag(turns), -jnp.diag(turns)])
+    candidates = goal[None] + shifts
+    is_inside = (candidates >= arm.lower[address][None]) & (candidates <= arm.upper[address][None])
+    is_equivalent: Array = jnp.all(is_inside, axis=1) & jnp.any(shifts != 0.0, axis=1)
+    travel: Array = jnp.linalg.norm(candidates - start[None], axis=1)
+    nearest = jnp.argsort(jnp.where(is_equivalent, travel, jnp.inf))[:NUM_EQUIVALENTS]
+    goals = jnp.concatenate([goal[None], candidates[nearest]])
+    return goals, jnp.concatenate([jnp.ones(1, bool), is_equivalent[nearest]])
 
 
 def _is_good(arm: Arm, qpos: Array) -> Array:

@@ -15,6 +15,7 @@ from mujoco import mjx
 
 from vsearch_jax.robot import collision, kinematics
 from vsearch_jax.robot.kinematics import Joints, Placement
+from vsearch_jax.robot.rest import rest_pose
 from vsearch_jax.scene import Scene, SceneError
 
 
@@ -32,11 +33,13 @@ class Arm:
       cameras: Placement of the cameras.
       lower: f32[nq] rad or m, lower joint limits; -inf for a joint without limits.
       upper: f32[nq] rad or m, upper joint limits; +inf for a joint without limits.
-      home: f32[nq] rad or m, middle of the limits; `qpos0` for a joint without limits.
+      home: f32[nq] rad or m, rest pose: middle of the limits; `qpos0` for a joint without limits. A gripper with
+        equality constraints rests where they hold.
       speed: f32[nq] rad/s or m/s, speed limits; NaN where the model gives none. The model gives a speed limit as the
         attribute `user` of a joint.
       pairs: pairs of geoms that must not touch.
-      planning_pairs: the subset of `pairs` that planning checks. Ellipsoids are replaced by enclosing capsules.
+      planning_pairs: the subset of `pairs` that planning checks. Ellipsoids around the arm are replaced by enclosing
+        capsules.
       table_height: f32[] m, world z of the table.
       table_clearance: f32[] m, minimum distance of the arm from the table.
       data: mjx.Data, template that `forward_kinematics` fills.
@@ -85,7 +88,7 @@ def build_arm(scene: Scene) -> Arm:
     """Builds the arm of a scene: its kinematics, its joint limits, and the pairs of geoms that must not touch.
 
     Raises:
-      SceneError: a joint that moves the wrist camera has no limits.
+      SceneError: a joint that moves the wrist camera, or a slide, has no limits.
     """
     model, data = scene.mj_model, _data_at_qpos0(scene.mj_model)
     joints = kinematics.build_joints(model, data)
@@ -102,7 +105,7 @@ def build_arm(scene: Scene) -> Arm:
         cameras=cameras,
         lower=jnp.asarray(lower, jnp.float32),
         upper=jnp.asarray(upper, jnp.float32),
-        home=jnp.asarray(_home(model, lower, upper), jnp.float32),
+        home=jnp.asarray(rest_pose(model, lower, upper, scene.joint_ids), jnp.float32),
         speed=jnp.asarray(speed, jnp.float32),
         pairs=pairs,
         planning_pairs=planning_pairs,
@@ -146,7 +149,8 @@ def _joint_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         address = model.jnt_qposadr[joint]
         if model.jnt_limited[joint]:
             lower[address], upper[address] = model.jnt_range[joint]
-        elif joint in scene.joint_ids:
+        # How far a finger's slide can move geoms bounds their distances, too.
+        elif joint in scene.joint_ids or model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
             raise SceneError(
                 f"joint {model.joint(joint).name!r} has no limits, but planning needs them; "
                 "give the joint a `range` in the arm's file"
@@ -154,13 +158,6 @@ def _joint_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if model.nuser_jnt and model.jnt_user[joint, 0] > 0:
             speed[address] = model.jnt_user[joint, 0]
     return lower, upper, speed
-
-
-def _home(model: mujoco.MjModel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Returns f64[nq], the middle of the limits; `qpos0` for joints without limits."""
-    is_limited, home = np.isfinite(lower), model.qpos0.copy()
-    home[is_limited] = 0.5 * (lower[is_limited] + upper[is_limited])
-    return home
 
 
 def _build_collision_pairs(scene: Scene, data: mujoco.MjData) -> tuple[collision.Pairs, collision.Pairs]:
@@ -244,9 +241,9 @@ def camera_kinematics(arm: Arm, joint_values: Array) -> tuple[Array, Array, Arra
 def clearance(arm: Arm, data: mjx.Data) -> Clearance:
     """Computes how far the arm is from the table, the object, the obstacles and itself.
 
-    A geom of the arm that is not a capsule counts as its enclosing capsule. A mesh counts as its bounding box. These
-    solids contain the geom, so the true distance is never smaller than the result. As in MuJoCo, pairs of neighbouring
-    links and pairs that the model excludes are ignored.
+    Geoms have the shapes that MuJoCo collides: a mesh counts as its convex hull. Only an object's mesh and a height
+    field count as their bounding boxes. The true distance is never smaller than the result. As in MuJoCo, pairs of
+    neighbouring links and pairs that the model excludes are ignored, and those of `<contact><pair>` are added.
 
     Args:
       arm: the arm.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +30,8 @@ from vsearch_jax.scene.surface import surface_points
 ARM_PREFIX = "arm/"
 OBJECT_PREFIX = "object/"
 OBSTACLE_PREFIX = "obstacle/"
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ def build_scene(config: SceneConfig) -> Scene:
         - A name is unknown, or a file is missing or cannot be loaded.
         - The arm has no site `tcp`, no camera `wrist`, or no joint that moves the camera.
         - The arm has a ball joint, or a free joint that moves the camera. (Free joints of loose parts are removed.)
-        - The camera is orthographic, or its sensor is not square and centred.
+        - The camera is not fixed to its body, it is orthographic, or its sensor is not square and centred.
         - The object is of an unknown format, it has no geom, or its symmetry is no whole number.
         - The object is a mesh that is too large or too small.
         - A geom that the arm could touch is a plane.
@@ -106,6 +109,7 @@ def build_scene(config: SceneConfig) -> Scene:
     _check_planes(model)
     camera_id = model.camera(ARM_PREFIX + WRIST_CAMERA).id
     _check_camera(model, camera_id, arm_path)
+    _warn_without_contacts(model, arm_path)
     joint_ids = _camera_joints(model, camera_id, arm_path)
     mount_id = model.body("mount").id
     object_geom_ids = _geoms_below(model, model.body("object").id)
@@ -159,8 +163,10 @@ def _attach(spec: mujoco.MjSpec, child: mujoco.MjSpec, body: mujoco.MjsBody, pre
 
 def _check_planes(model: mujoco.MjModel) -> None:
     """Raises SceneError if the arm could touch a plane. Distances are computed for bounded solids only."""
+    in_pair = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
     for geom in np.flatnonzero(model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)):
-        if model.geom_contype[geom] | model.geom_conaffinity[geom] and geom != model.geom("table").id:
+        can_touch = geom in in_pair or model.geom_contype[geom] | model.geom_conaffinity[geom]
+        if can_touch and geom != model.geom("table").id:
             name = model.geom(geom).name
             raise SceneError(
                 f"geom {name!r} (number {geom}) is a plane, but the arm can only keep its distance from bounded "
@@ -168,8 +174,25 @@ def _check_planes(model: mujoco.MjModel) -> None:
             )
 
 
+def _warn_without_contacts(model: mujoco.MjModel, path: Path) -> None:
+    """Logs a warning if no moving geom of the arm can touch the scene. The object and obstacles are static."""
+    is_moving = model.body_weldid[model.geom_bodyid] != 0
+    if not np.any((model.geom_contype | model.geom_conaffinity)[is_moving]):
+        _LOG.warning(
+            "arm file %r: contype and conaffinity of all moving geoms are 0, so planning lets the arm pass through the "
+            "table, the object and obstacles; give the geoms that collide contype and conaffinity 1",
+            str(path),
+        )
+
+
 def _check_camera(model: mujoco.MjModel, camera_id: int, path: Path) -> None:
-    """Raises SceneError if the wrist camera is orthographic, or its sensor is not square and centred."""
+    """Raises SceneError if the wrist camera is not fixed to its body or its images are not square and centred."""
+    if model.cam_mode[camera_id] != int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED):
+        mode = mujoco.mjtCamLight(int(model.cam_mode[camera_id])).name.removeprefix("mjCAMLIGHT_").lower()
+        raise SceneError(
+            f"arm file {str(path)!r}: camera {WRIST_CAMERA!r} has mode {mode!r}, but planning needs a camera that is "
+            "fixed to its body; remove `mode` and `target`, and aim the camera by `pos` and `quat`"
+        )
     is_perspective = model.cam_projection[camera_id] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
     focal, principal = model.cam_intrinsic[camera_id, :2], model.cam_intrinsic[camera_id, 2:]
     # Images are square. MuJoCo computes the field of view from the height of the sensor.

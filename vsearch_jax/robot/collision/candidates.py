@@ -1,4 +1,4 @@
-"""Which geoms can touch each other, by MuJoCo's rules."""
+"""Which geoms can touch each other, by MuJoCo's rules: contact bits, weld groups, neighbours, excludes and pairs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def touching_pairs(
     moving = _moving_geoms(model, geoms)
     fixed = [*(g for g in geoms.arm if g not in moving), *geoms.mount, *geoms.object, *geoms.obstacles]
     pairs = [(a, b) for i, a in enumerate(moving) for b in [*moving[i + 1 :], *fixed]]
-    pairs = [(a, b) for a, b in pairs if _can_touch(model, a, b)]
+    # MuJoCo applies no filter to the pairs of <contact><pair>.
+    explicit = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+    pairs = [(a, b) for a, b in pairs if frozenset((a, b)) in explicit or _can_touch(model, a, b)]
     return [pair for pair in pairs if not is_for_planning or _can_come_near(model, data, pair)]
 
 

@@ -1,7 +1,8 @@
 """Signed distances of all pairs in `Pairs`.
 
 The distance between a capsule's axis and another axis, a box or a cylinder takes a fixed number of operations. The
-distance from an ellipsoid is convex along the axis; golden-section search finds its minimum.
+distance from an ellipsoid is convex along the axis; golden-section search finds its minimum. Pairs with another solid
+of the arm use GJK; see `robot.collision.convex`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax.robot.collision import primitives
-from vsearch_jax.robot.collision.pairs import Pairs, Solids
+from vsearch_jax.robot.collision.convex import Frames, convex_distances, lowest_points
+from vsearch_jax.robot.collision.pairs import ConvexPairs, Pairs, Solids
 from vsearch_jax.robot.kinematics import rotate_each
 from vsearch_jax.xla.batching import append_axes
 from vsearch_jax.xla.vectors import Vector, dot
@@ -36,8 +38,8 @@ class Axes(NamedTuple):
 def pair_distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_height: Array) -> Array:
     """Computes the signed distances between the geoms of all collision pairs, from the poses of the geoms.
 
-    If the axis of a capsule intersects a box or a cylinder, the distance is minus the capsule's radius. How deep the
-    axis lies inside is not measured.
+    The depth of a penetration is not measured, except between two capsules and with the table. If the axis of a capsule
+    intersects a box or a cylinder, the distance is minus the capsule's radius.
 
     Args:
       pairs: the N pairs of geoms that must not touch.
@@ -52,7 +54,10 @@ def pair_distances(pairs: Pairs, geom_xpos: Array, geom_xmat: Array, table_heigh
     offset = primitives.rotate(rotation, primitives.coordinates(pairs.center))
     center = primitives.add_scaled(offset, jnp.ones_like(pairs.radius), primitives.coordinates(geom_xpos[pairs.geom]))
     half_axis = primitives.rotate(rotation, primitives.coordinates(pairs.half_axis))
-    return distances_from_axes(pairs, Axes(center, half_axis), table_height)
+    frames = Frames(
+        primitives.coordinates(geom_xpos[pairs.bodies.geom]), _rows_of_matrices(geom_xmat[pairs.bodies.geom])
+    )
+    return distances_from_poses(pairs, Axes(center, half_axis), frames, table_height)
 
 
 def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
@@ -74,14 +79,40 @@ def capsule_axes(pairs: Pairs, rotations: Array, positions: Array) -> Axes:
     return Axes((center[:, 0], center[:, 1], center[:, 2]), (half_axis[:, 0], half_axis[:, 1], half_axis[:, 2]))
 
 
-def distances_from_axes(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
-    """Computes the signed distances between the geoms of all collision pairs, from the axes of the capsules.
+def body_frames(pairs: Pairs, rotations: Array, positions: Array) -> Frames:
+    """Computes the poses of the S bodies (`Pairs.bodies`) in world, from the frames of the joints.
+
+    Args:
+      pairs: the pairs of geoms that must not touch, and the S bodies of these pairs.
+      rotations: f32[J + 1, 3, 3], frame to world, for the world and the J joints, from `robot.kinematics.frames`.
+      positions: f32[J + 1, 3] m in world, origins of these frames. Both arrays may have a batch axis at the end.
+
+    Returns:
+      Poses of the S bodies in world; the batch axis, if any, is at the end.
+    """
+    placement = pairs.bodies.placement
+    expand = functools.partial(append_axes, count=positions.ndim - 2)
+    rotation = rotations[placement.frame]
+    position = positions[placement.frame] + rotate_each(rotation, expand(placement.position))
+    rotation = jnp.sum(rotation[:, :, :, None] * expand(placement.rotation)[:, None], axis=2)
+    return Frames((position[:, 0], position[:, 1], position[:, 2]), _rows_of_matrices(rotation))
+
+
+def _rows_of_matrices(matrices: Array) -> tuple[Vector, Vector, Vector]:
+    """Splits f32[S, 3, 3, ...] into three rows of three arrays f32[S, ...]."""
+    x, y, z = ((matrices[:, row, 0], matrices[:, row, 1], matrices[:, row, 2]) for row in range(3))
+    return x, y, z
+
+
+def distances_from_poses(pairs: Pairs, axes: Axes, frames: Frames, table_height: Array) -> Array:
+    """Computes the signed distances between the geoms of all collision pairs, from the poses of capsules and bodies.
 
     `pair_distances` computes the same distances from the poses of the geoms.
 
     Args:
       pairs: the N pairs of geoms that must not touch.
       axes: axes of the capsules in world, from `capsule_axes`. A batch axis at the end is allowed.
+      frames: poses of the bodies in world, from `body_frames`, with the same batch axis.
       table_height: f32[] m, world z of the table.
 
     Returns:
@@ -103,7 +134,20 @@ def distances_from_axes(pairs: Pairs, axes: Axes, table_height: Array) -> Array:
         if kind.capsule.size > 0:  # A kind without pairs would take as long to trace as any other.
             size = jax.tree.map(expand, primitives.coordinates(kind.size))
             parts.append(distance(*_axes_in_solid_frames(kind, axes, expand), size) - radius[kind.capsule])
+    parts += [_convex_pair_distances(group, frames, table_height) for group in pairs.convex]
     return jnp.concatenate(parts)
+
+
+def _convex_pair_distances(group: ConvexPairs, frames: Frames, table_height: Array) -> Array:
+    first = _frame_rows(frames, group.first)
+    if group.second_side is None:
+        return lowest_points(group.first_side, first) - table_height
+    return convex_distances(group.first_side, group.second_side, (first, _frame_rows(frames, group.second)))
+
+
+def _frame_rows(frames: Frames, index: Array) -> Frames:
+    x, y, z = (_rows(row, index) for row in frames.rotation)
+    return Frames(_rows(frames.position, index), (x, y, z))
 
 
 def _segment_cylinder_distance(center: Vector, half_axis: Vector, size: Vector) -> Array:

@@ -5,6 +5,7 @@ Planning uses them to prove that nothing touches between two configurations.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import mujoco
@@ -14,6 +15,8 @@ from vsearch_jax.scene import joints_above
 
 HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+# m. A point this near to an axis counts as a point on the axis.
+ON_AXIS = 1e-9
 
 
 def lever_arms(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[int, ...]) -> np.ndarray:
@@ -54,11 +57,25 @@ def extent_from_still_point(model: mujoco.MjModel, data: mujoco.MjData, geom: in
       The ball's centre, f64[3] m in world, a point that no joint moves. The ball's radius in m.
     """
     chain = joints_above(model, int(model.geom_bodyid[geom]))
-    while len(chain) > 1 and model.jnt_type[chain[0]] == HINGE:
-        if _axis_distance(data, chain[0], data.xanchor[chain[1]]) > 1e-9:
-            break
-        chain = chain[1:]  # The hinge does not move the next anchor, which lies on its axis.
+    first = _num_joints_before_still_point(model, data, chain)
+    chain = chain[first:]
     return data.xanchor[chain[0]], _max_slide(model, chain[:1]) + _max_anchor_distance(model, data, geom, chain)
+
+
+def _num_joints_before_still_point(model: mujoco.MjModel, data: mujoco.MjData, chain: Sequence[int]) -> int:
+    """Returns the largest number of joints at the start of `chain` that do not move the anchor of the next joint.
+
+    A point does not move if it lies on the axes of all hinges before it. The axis of the last one alone is not enough:
+    the hinges before it move this axis.
+    """
+    found = 0
+    for count in range(1, len(chain)):
+        if model.jnt_type[chain[count - 1]] != HINGE:
+            break
+        anchor = data.xanchor[chain[count]]
+        if max(_axis_distance(data, joint, anchor) for joint in chain[:count]) <= ON_AXIS:
+            found = count
+    return found
 
 
 def _max_axis_distance(model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]) -> float:
@@ -94,10 +111,15 @@ def _axis_distance(data: mujoco.MjData, joint: int, point: np.ndarray) -> float:
     return float(np.linalg.norm(np.cross(data.xaxis[joint], point - data.xanchor[joint])))
 
 
-def _enclosing_balls(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[list[np.ndarray], float]:
-    """Returns centres (f64[3] m in world) and the common radius in m of balls whose convex hull contains `geom`."""
-    center = data.geom_xpos[geom]
-    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        half_axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
-        return [center - half_axis, center + half_axis], float(model.geom_size[geom, 0])
-    return [center], float(model.geom_rbound[geom])
+def _enclosing_balls(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.ndarray, float]:
+    """Returns centres f64[K, 3] m in world and the common radius in m of balls whose convex hull contains `geom`.
+
+    The balls of a sphere and of a capsule have its radius. For another geom they are the corners of its bounding box.
+    """
+    kind, rotation = int(model.geom_type[geom]), data.geom_xmat[geom].reshape(3, 3)
+    if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+        half_length = float(model.geom_size[geom, 1]) if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
+        return data.geom_xpos[geom] + np.outer([-half_length, half_length], rotation[:, 2]), model.geom_size[geom, 0]
+    center, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    corners = center + half_sizes * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    return data.geom_xpos[geom] + corners @ rotation.T, 0.0
