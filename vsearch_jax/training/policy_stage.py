@@ -84,7 +84,7 @@ def _step_metrics(env: ViewSearchEnv, ends: State) -> Metrics:
     terminated, truncated = ends.info["terminated"], ends.info["truncated"]
     episode = episode_of(ends)
     rotation, _, _ = pose_error(episode.observation.camera, episode.target.camera, env.scene.symmetry, env.center)
-    is_right = rotation <= math.radians(FALSE_POSITIVE_DEG)
+    is_right = (rotation <= math.radians(FALSE_POSITIVE_DEG)).astype(terminated.dtype)
     return {
         "reward": ends.reward.mean(),
         "similarity": ends.metrics["similarity"].mean(),
