@@ -108,7 +108,9 @@ def test_a_missing_device_or_a_refused_setting_is_one_line_and_makes_no_folder(
         message = user_error(capsys, *command)
         assert "finds no device: Unable to initialize backend 'cuda': no GPU; set JAX_PLATFORMS=cpu" in message
     for name in ("jax_enable_x64", "jax_debug_nans"):
-        with monkeypatch.context() as context:
-            context.setitem(jax.config.values, name, True)
+        jax.config.update(name, True)
+        try:
             assert f"switch it off: {name.upper()}=0" in user_error(capsys, *command)
+        finally:
+            jax.config.update(name, False)
     assert not any(tmp_path.iterdir())

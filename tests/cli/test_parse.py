@@ -109,7 +109,7 @@ def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
         ("", "train, eval, export, reach, video, info"),
         ("bogus", "unknown command 'bogus'; allowed: train, eval, export, reach, video, info"),
         ("train", "--out"),
-        ("train --out {out} --preset huge", "--preset is 'huge'; allowed: smoke, cpu, thesis, gpu"),
+        ("train --out {out} --preset huge", "--preset is 'huge'; allowed: smoke, cpu, autoencoder, thesis, gpu"),
         ("train --out {out} --encoder.num-updates 0", "--encoder.num-updates is 0; allowed: greater than 0"),
         ("train --out {out} --encoder.num-updates many", "--encoder.num-updates: invalid literal for int.* 'many'"),
         ("train --out {out} --input infrared", "infrared"),

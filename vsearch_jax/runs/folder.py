@@ -14,12 +14,14 @@ import time
 import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from vsearch_jax.config import Config, ConfigError
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.old_versions import with_later_fields
-from vsearch_jax.scene import Fingerprint
+
+if TYPE_CHECKING:  # `--help` loads this module, and must not load MuJoCo
+    from vsearch_jax.scene import Fingerprint
 
 try:
     import fcntl
@@ -262,7 +264,7 @@ def read_files(run: Path) -> Fingerprint:
     parts = files.values() if isinstance(files, dict) else [None]
     if not all(isinstance(part, dict) and isinstance(part.get("files"), dict) and "model" in part for part in parts):
         raise ConfigFileError(f"{run / CONFIG}: {_FILES} is damaged; {_REMEDY}")
-    return cast(Fingerprint, files)
+    return cast("Fingerprint", files)
 
 
 def _read_json(run: Path) -> dict[str, object]:
