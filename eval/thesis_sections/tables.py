@@ -149,8 +149,20 @@ def to_markdown(content: Mapping[str, Any]) -> str:
             for row in content["table_5_1"]
         ],
     )
-    lines += ["", "## Sections 5.1 to 5.5: all searchers", ""]
-    lines += _table(
+    lines += ["", "## Sections 5.1 to 5.5: all searchers", "", *_searchers(content["searchers"])]
+    title = "## Random search: samples in ten that are uniform over the band (ours; 0 is the thesis's)"
+    lines += ["", title, "", *_wide_samples(content["wide_sweep"])]
+    lines += ["", "## Table 5.2: CMA-ES with the penalty, and solved with bounds", ""]
+    header = ["trial", "initial cosine", "initial °", "initial cm", "penalty: final cosine of the first run"]
+    header += ["penalty: success (%)", "bounds: success (%), images", "bounds and restarts: success (%), images"]
+    lines += _table(header, [_penalty_cells(row) for row in content["table_5_2"]])
+    for number, title in _FIGURES.items():
+        lines += ["", f"## Figure {number}: {title}", "", f"![{title}](figures/{figure_name(number)})"]
+    return "\n".join(lines) + "\n"
+
+
+def _searchers(rows: Sequence[Row]) -> list[str]:
+    return _table(
         [
             "",
             "trials",
@@ -172,11 +184,13 @@ def to_markdown(content: Mapping[str, Any]) -> str:
                 _cell(row, "translation_error_cm_mean", 1),
                 _failures(row),
             ]
-            for row in content["searchers"]
+            for row in rows
         ],
     )
-    lines += ["", "## Random search: samples in ten that are uniform over the band (ours; 0 is the thesis's)", ""]
-    lines += _table(
+
+
+def _wide_samples(rows: Sequence[Row]) -> list[str]:
+    return _table(
         ["wide samples", "trials", "pose success (%)", "images", "rotational error (°)"],
         [
             [
@@ -186,16 +200,9 @@ def to_markdown(content: Mapping[str, Any]) -> str:
                 _cell(row, "evaluations_mean", 1),
                 _cell(row, "rotation_error_deg_mean", 1),
             ]
-            for row in content["wide_sweep"]
+            for row in rows
         ],
     )
-    lines += ["", "## Table 5.2: CMA-ES with the penalty, and solved with bounds", ""]
-    header = ["trial", "initial cosine", "initial °", "initial cm", "penalty: final cosine of the first run"]
-    header += ["penalty: success (%)", "bounds: success (%), images", "bounds and restarts: success (%), images"]
-    lines += _table(header, [_penalty_cells(row) for row in content["table_5_2"]])
-    for number, title in _FIGURES.items():
-        lines += ["", f"## Figure {number}: {title}", "", f"![{title}](figures/{figure_name(number)})"]
-    return "\n".join(lines) + "\n"
 
 
 def figure_name(number: str) -> str:

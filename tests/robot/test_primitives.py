@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vsearch_jax.robot.collision import primitives
@@ -35,6 +35,8 @@ def solid(request):
 
 
 @given(point=_point, size=_size)
+@example(point=jnp.asarray([0.1875, 0.0, 0.1875]), size=jnp.asarray([0.25, 0.125, 0.25]))
+@example(point=jnp.asarray([0.3, 0.3, 0.0]), size=jnp.asarray([0.3, 0.3, 0.01]))
 def test_distance_of_a_point_from_a_solid_equals_mujoco(solid, point, size):
     kind, distance = solid
     spec = mujoco.MjSpec()

@@ -136,22 +136,21 @@ def _train_chunks(
     run: Path, state: TrainState, config: Config, on_chunk: OnChunk, stop_requested: threading.Event
 ) -> TrainState:
     step = int(state.step)
-    log = MetricsLog(run, step)
-    while step < config.num_iterations:
-        start_time = time.perf_counter()
-        state, metrics = call_interruptibly(train, state, config)
-        seconds = time.perf_counter() - start_time
-        new_step = int(state.step)
-        # The last chunk may be shorter than its arrays.
-        columns = {name: np.asarray(column)[: new_step - step] for name, column in metrics.items()}
-        check_finite(run, columns, step, config)
-        log.append(columns, step, seconds)
-        checkpoint.save(run, state, config)
-        on_chunk(new_step, seconds, log.lines[step - new_step :])
-        step = new_step
-        if stop_requested.is_set():
-            raise KeyboardInterrupt
-    log.close()
+    with contextlib.closing(MetricsLog(run, step)) as log:
+        while step < config.num_iterations:
+            start_time = time.perf_counter()
+            state, metrics = call_interruptibly(train, state, config)
+            seconds = time.perf_counter() - start_time
+            new_step = int(state.step)
+            # The last chunk may be shorter than its arrays.
+            columns = {name: np.asarray(column)[: new_step - step] for name, column in metrics.items()}
+            check_finite(run, columns, step, config)
+            log.append(columns, step, seconds)
+            checkpoint.save(run, state, config)
+            on_chunk(new_step, seconds, log.lines[step - new_step :])
+            step = new_step
+            if stop_requested.is_set():
+                raise KeyboardInterrupt
     return state
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
@@ -12,14 +13,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import (  # generated code, of which pyright sees no names
-    Event,  # pyright: ignore[reportAttributeAccessIssue]
-    SessionLog,  # pyright: ignore[reportAttributeAccessIssue]
-)
 from tensorboardX.summary import scalar
 
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.folder import EVENTS, METRICS, RunError
+
+_EVENTS: Any = importlib.import_module("tensorboardX.proto.event_pb2")
+"""Generated code: its classes have no types."""
 
 MetricsLine: TypeAlias = dict[str, Any]
 """One line of `metrics.jsonl`: `iteration` int, `stage` str, `seconds` float, and a float for each metric."""
@@ -87,7 +87,8 @@ class MetricsLog:
         # Not SummaryWriter: it writes in a thread, where an error of the disk is a traceback and no exception.
         self._events = EventsWriter(str(run / EVENTS / "events"))
         # TensorBoard hides the events of this step and later from files before this one.
-        self._add_event(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
+        start = _EVENTS.SessionLog(status=_EVENTS.SessionLog.START)
+        self._add_event(_EVENTS.Event(step=step, session_log=start))
         self._events.flush()
 
     def append(self, metrics: Mapping[str, np.ndarray], first: int, seconds: float) -> None:
@@ -116,11 +117,11 @@ class MetricsLog:
         for line in new:
             for name in line.keys() - {"iteration", "stage"}:
                 summary = scalar(f"{line['stage']}/{name}", line[name])
-                self._add_event(Event(step=line["iteration"], summary=summary))
+                self._add_event(_EVENTS.Event(step=line["iteration"], summary=summary))
         self._events.flush()
         self.lines += new
 
-    def _add_event(self, event: Event) -> None:
+    def _add_event(self, event: Any) -> None:
         event.wall_time = time.time()
         self._events.write_event(event)
 

@@ -25,7 +25,7 @@ SEARCH_ITERATIONS = 14
 TANGENT_ITERATIONS = 6
 # Newton's method on a convex function converges quadratically from the left. The remaining error makes the distance
 # smaller.
-NEWTON_ITERATIONS = 6
+NEWTON_ITERATIONS = 7
 
 
 def coordinates(vectors: Array) -> Vector:
@@ -213,7 +213,10 @@ def ellipsoid_distance(point: Vector, size: Vector) -> Array:
     # The floor makes the nearest point unique at the centre and in the planes of symmetry.
     p = tuple(jnp.maximum(jnp.abs(x), 1e-7) for x in point)
     squared = tuple(r * r for r in size)
-    t = functools.reduce(jnp.maximum, [r * x - r * r for r, x in zip(size, p, strict=True)])
+    # Two lower bounds of the root: one coordinate alone, and all coordinates with the largest radius below.
+    scaled = (size[0] * p[0], size[1] * p[1], size[2] * p[2])
+    bounds = [x - rr for x, rr in zip(scaled, squared, strict=True)]
+    t = functools.reduce(jnp.maximum, [*bounds, length(scaled) - functools.reduce(jnp.maximum, squared)])
     for _ in range(NEWTON_ITERATIONS):
         ratios = [(r * x / (t + rr)) ** 2 for r, x, rr in zip(size, p, squared, strict=True)]
         slope = -2.0 * sum(ratio / (t + rr) for ratio, rr in zip(ratios, squared, strict=True))
