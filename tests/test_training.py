@@ -186,9 +186,10 @@ def test_the_arrays_of_version_0_1_0_are_those_of_this_version():
     stored = json.loads(ARRAYS_OF_0_1_0.read_text())
     names = current_names(stored, "0.1.0")
     assert len(set(names.values())) == len(names)
-    # What version 0.1.0 trained was the autoencoder, by Adam, without a hidden layer.
+    # What version 0.1.0 trained was the autoencoder, by Adam, without a hidden layer, and a policy without shared layers.
     encoder = dataclasses.replace(SMOKE.encoder, loss="autoencoder", optimizer="adam", hidden_sizes=())
-    config = dataclasses.replace(SMOKE, encoder=encoder)
+    policy = dataclasses.replace(SMOKE.sac, network="plain")
+    config = dataclasses.replace(SMOKE, encoder=encoder, sac=policy)
     state = jax.eval_shape(lambda key: vs.init(key, config), jax.random.key(0))
     assert {current: stored[old] for old, current in names.items()} == {
         jax.tree_util.keystr(path, simple=True, separator="."): describe(leaf)
