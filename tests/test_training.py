@@ -186,7 +186,7 @@ def test_the_arrays_of_version_0_1_0_are_those_of_this_version():
     stored = json.loads(ARRAYS_OF_0_1_0.read_text())
     names = current_names(stored, "0.1.0")
     assert len(set(names.values())) == len(names)
-    # What version 0.1.0 trained was the autoencoder, by Adam, without a hidden layer, and a policy without shared layers.
+    # Version 0.1.0 had the autoencoder, by Adam, without a hidden layer, and a policy without shared layers.
     encoder = dataclasses.replace(SMOKE.encoder, loss="autoencoder", optimizer="adam", hidden_sizes=())
     policy = dataclasses.replace(SMOKE.sac, network="plain")
     config = dataclasses.replace(SMOKE, encoder=encoder, sac=policy)
