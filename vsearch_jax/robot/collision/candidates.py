@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -11,6 +12,10 @@ from vsearch_jax.robot.collision.motion_bounds import extent_from_still_point
 
 NEVER_NEAR = 0.05
 """m. Planning ignores pairs whose distance is never smaller than this, because they never limit a motion."""
+RESTING = 2e-5
+"""m. A pair that is never farther apart than this, and never in contact, is left out."""
+NUM_CONFIGURATIONS = 64
+"""Random configurations in all of which a pair must rest to be left out."""
 
 
 class Geoms(NamedTuple):
@@ -32,7 +37,7 @@ class Geoms(NamedTuple):
 def touching_pairs(
     model: mujoco.MjModel, data: mujoco.MjData, geoms: Geoms, is_for_planning: bool
 ) -> list[tuple[int, int]]:
-    """Lists the pairs of geoms that can touch. Pairs with the table are not listed.
+    """Lists the pairs of geoms that can touch. Pairs with the table are not listed, nor pairs that rest on each other.
 
     Args:
       model: the compiled scene.
@@ -50,6 +55,8 @@ def touching_pairs(
     # MuJoCo applies no filter to the pairs of <contact><pair>.
     explicit = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
     pairs = [(a, b) for a, b in pairs if frozenset((a, b)) in explicit or _can_touch(model, a, b)]
+    resting = _resting_pairs(model, data, pairs)
+    pairs = [pair for pair in pairs if pair not in resting]
     return [pair for pair in pairs if not is_for_planning or _can_come_near(model, data, pair)]
 
 
@@ -72,6 +79,30 @@ def table_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: Geoms, is_for
 def _moving_geoms(model: mujoco.MjModel, geoms: Geoms) -> list[int]:
     """Returns the geoms of the arm that at least one joint moves."""
     return [g for g in geoms.arm if model.body_weldid[model.geom_bodyid[g]] != 0]
+
+
+def _resting_pairs(
+    model: mujoco.MjModel, data: mujoco.MjData, pairs: Sequence[tuple[int, int]]
+) -> set[tuple[int, int]]:
+    """Returns the pairs that lie against each other without contact in every configuration.
+
+    Links of some arms turn face to face, nanometres apart. Distances are exact to `RESTING` only, so such a pair would
+    count as touching for ever. C MuJoCo measures the distances of random configurations.
+    """
+
+    def rests(data: mujoco.MjData, pair: tuple[int, int]) -> bool:
+        gap = np.linalg.norm(data.geom_xpos[pair[0]] - data.geom_xpos[pair[1]]) - model.geom_rbound[list(pair)].sum()
+        return gap <= RESTING and 0.0 < mujoco.mj_geomDistance(model, data, *pair, 2.0 * RESTING, None) <= RESTING
+
+    resting = {pair for pair in pairs if rests(data, pair)}
+    other, random = mujoco.MjData(model), np.random.default_rng(0)
+    is_limited = model.jnt_limited.astype(bool)[:, None]
+    low, high = np.where(is_limited, model.jnt_range, [-np.pi, np.pi]).T
+    for _ in range(NUM_CONFIGURATIONS if resting else 0):
+        other.qpos[model.jnt_qposadr] = random.uniform(low, high)
+        mujoco.mj_kinematics(model, other)
+        resting = {pair for pair in resting if rests(other, pair)}
+    return resting
 
 
 def _can_come_near(model: mujoco.MjModel, data: mujoco.MjData, pair: tuple[int, int]) -> bool:
