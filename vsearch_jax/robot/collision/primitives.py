@@ -23,9 +23,9 @@ SEARCH_ITERATIONS = 14
 # Cutting planes leave an error of about 0.1 mm for the axes of a robot arm. The result is then too small, never too
 # large.
 TANGENT_ITERATIONS = 6
-# Newton's method on a convex function converges quadratically from the left. The remaining error makes the distance
-# smaller.
-NEWTON_ITERATIONS = 7
+# Newton's method converges from the left, so the remaining error makes the distance smaller. It is below 1e-6 m for
+# points outside of ellipsoids with radii of 1 to 30 cm.
+NEWTON_ITERATIONS = 6
 
 
 def coordinates(vectors: Array) -> Vector:
@@ -203,8 +203,9 @@ def ellipsoid_distance(point: Vector, size: Vector) -> Array:
     """Returns the signed distance f32[...] in m of a point from an ellipsoid's surface; negative inside.
 
     The nearest point of the surface is r^2 p / (t + r^2), for each coordinate p and radius r. Here t is the largest
-    root of sum (r p / (t + r^2))^2 = 1 (Eberly, Distance from a Point to an Ellipsoid). The sum is convex and falls
-    with t. Newton's method therefore converges from the left, and never passes the root.
+    root of S = sum (r p / (t + r^2))^2 = 1 (Eberly, Distance from a Point to an Ellipsoid). 1 / sqrt(S) is concave and
+    nearly linear in t (More and Sorensen 1983, Computing a Trust Region Step). So Newton's method for 1 / sqrt(S) = 1
+    converges fast from the left, and never passes the root.
 
     Args:
       point: Vector (x, y and z) in m, in the ellipsoid's frame.
@@ -213,14 +214,17 @@ def ellipsoid_distance(point: Vector, size: Vector) -> Array:
     # The floor makes the nearest point unique at the centre and in the planes of symmetry.
     p = tuple(jnp.maximum(jnp.abs(x), 1e-7) for x in point)
     squared = tuple(r * r for r in size)
-    # Two lower bounds of the root: one coordinate alone, and all coordinates with the largest radius below.
+    # Lower bounds of the root: one coordinate alone, all with the largest radius below, and 0 for a point outside.
     scaled = (size[0] * p[0], size[1] * p[1], size[2] * p[2])
     bounds = [x - rr for x, rr in zip(scaled, squared, strict=True)]
     t = functools.reduce(jnp.maximum, [*bounds, length(scaled) - functools.reduce(jnp.maximum, squared)])
+    is_outside = sum((x / r) ** 2 for x, r in zip(p, size, strict=True)) > 1.0
+    t = jnp.where(is_outside, jnp.maximum(t, 0.0), t)
     for _ in range(NEWTON_ITERATIONS):
-        ratios = [(r * x / (t + rr)) ** 2 for r, x, rr in zip(size, p, squared, strict=True)]
-        slope = -2.0 * sum(ratio / (t + rr) for ratio, rr in zip(ratios, squared, strict=True))
-        t = t - (sum(ratios) - 1.0) / slope
+        ratios = [(x / (t + rr)) ** 2 for x, rr in zip(scaled, squared, strict=True)]
+        total = functools.reduce(jnp.add, ratios)
+        slope = functools.reduce(jnp.add, [ratio / (t + rr) for ratio, rr in zip(ratios, squared, strict=True)])
+        t = t + total * (jnp.sqrt(total) - 1.0) / slope
     x, y, z = (x - rr * x / (t + rr) for x, rr in zip(p, squared, strict=True))
     return jnp.sign(t) * length((x, y, z))
 
