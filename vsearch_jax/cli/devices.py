@@ -18,8 +18,8 @@ def check_devices() -> None:
     try:
         jax.devices()
     except Exception as error:  # JAX raises several types if JAX_PLATFORMS names a missing platform.
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split())  # empty for a missing CUDA plugin
         raise DeviceError(
-            f"JAX finds no device: {reason}; set JAX_PLATFORMS=cpu, or install JAX for the platform that JAX_PLATFORMS "
-            "names"
+            f"JAX finds no device{f': {reason}' if reason else ''}; set JAX_PLATFORMS=cpu, or install JAX for the "
+            "platform that JAX_PLATFORMS names"
         ) from error
