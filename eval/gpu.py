@@ -13,7 +13,6 @@ import json
 import math
 import os
 import platform
-import subprocess
 import sys
 import time
 import traceback
@@ -30,6 +29,7 @@ import vsearch_jax as vs
 from gpu_sections import learning, parity, planning, rendering
 from gpu_sections.measure import Row, Settings
 from vsearch_jax.cli.errors import one_line_errors
+from vsearch_jax.report.provenance import commit
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.types import TrainState
 
@@ -117,14 +117,6 @@ def _text(value: object) -> str:
     return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _commit() -> str | None:
-    command = ["git", "-C", str(Path(__file__).resolve().parent), "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
 def _version(name: str) -> str | None:
     try:
         return importlib.metadata.version(name)
@@ -167,7 +159,7 @@ def main(arguments: list[str]) -> int:
     settings = Settings(options.quick, time.perf_counter() + 60.0 * minutes, 0.2 if options.quick else 1.5)
     # A quick run trains the same preset in both sections.
     names = options.sections or [name for name in SECTIONS if not (options.quick and name == "thesis")]
-    report = Report(options.out, " ".join(["python eval/gpu.py", *arguments]), options.commit or _commit())
+    report = Report(options.out, " ".join(["python eval/gpu.py", *arguments]), options.commit or commit())
     print(json.dumps(report.machine), flush=True)
     run_sections(report, names, settings)
     failures = report.failures()

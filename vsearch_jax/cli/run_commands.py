@@ -21,7 +21,7 @@ from vsearch_jax.export import stablehlo
 from vsearch_jax.runs import loop
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.folder import RunError, lock_folder, new_file, new_folder, read_config, read_seed
-from vsearch_jax.scene import build_scene, describe_symmetry
+from vsearch_jax.scene import describe_symmetry, object_symmetry
 from vsearch_jax.types import TrainState
 
 
@@ -53,7 +53,7 @@ def _train(command: Train) -> None:
     with made, lock_folder(run):
         with show_status(console, "building the scene, computing what the arm reaches"):
             state = _resume(command) if command.resume else _start(command)
-        if sentence := describe_symmetry(build_scene(config.scene).symmetry):
+        if sentence := describe_symmetry(object_symmetry(config.scene)):
             console.print(sentence, highlight=False, soft_wrap=True)
         with training_progress(console, config, int(state.step)) as progress:
             state = loop.train_to_end(run, state, config, progress.update, progress.announce_stop)

@@ -18,7 +18,7 @@ from vsearch_jax.report.summary import Results, false_positive_warning, summariz
 from vsearch_jax.report.table import FOOTNOTE, describe_motion, table_rows
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.loop import Evaluated
-from vsearch_jax.scene import build_scene, describe_symmetry
+from vsearch_jax.scene import describe_symmetry, object_symmetry
 from vsearch_jax.search import BLACK_BOX, LABELS
 
 CAPTIONS = {
@@ -49,7 +49,7 @@ def write_report(folder: Path, evaluated: Evaluated, config: Config) -> Results:
       OSError: the disk is full or not writable.
     """
     results = summarize_results(evaluated.arrays, config, evaluated.wall_seconds)
-    results |= {"seed": evaluated.seed, "symmetry": build_scene(config.scene).symmetry}
+    results |= {"seed": evaluated.seed, "symmetry": object_symmetry(config.scene)}
     write_files(folder, results, draw_figures(results, evaluated, config), config)
     return results
 

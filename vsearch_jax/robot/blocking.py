@@ -5,12 +5,11 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from vsearch_jax.robot.collision.candidates import NUM_CONFIGURATIONS, random_configurations
 from vsearch_jax.robot.collision.solids import convex_solid
 from vsearch_jax.scene import Scene
 from vsearch_jax.scene.assembly import ARM_PREFIX
 
-NUM_CONFIGURATIONS = 64
-"""Random configurations in all of which a pair must touch."""
 MAX_NAMED = 4
 """Pairs that a message names."""
 
@@ -40,13 +39,8 @@ def _always_touching(scene: Scene) -> dict[tuple[int, int], float]:
     The value is how far in m the first geom reaches below the plane of the arm's base, at least.
     """
     model, arm_geoms = scene.mj_model, set(scene.arm_geom_ids)
-    data, random = mujoco.MjData(model), np.random.default_rng(0)
-    is_limited = model.jnt_limited.astype(bool)[:, None]
-    low, high = np.where(is_limited, model.jnt_range, [-np.pi, np.pi]).T
     found: dict[tuple[int, int], float] | None = None
-    for _ in range(NUM_CONFIGURATIONS):
-        data.qpos[model.jnt_qposadr] = random.uniform(low, high)
-        mujoco.mj_kinematics(model, data)
+    for data in random_configurations(model):
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         pairs = {(int(c.geom1), int(c.geom2)) for c in data.contact if c.dist <= 0.0}

@@ -18,7 +18,7 @@ from tensorboardX.summary import scalar
 from vsearch_jax.runs.atomic import write_atomically
 from vsearch_jax.runs.folder import EVENTS, METRICS, RunError
 
-_EVENTS: Any = importlib.import_module("tensorboardX.proto.event_pb2")
+_PB2: Any = importlib.import_module("tensorboardX.proto.event_pb2")
 """Generated code: its classes have no types."""
 
 MetricsLine: TypeAlias = dict[str, Any]
@@ -87,8 +87,8 @@ class MetricsLog:
         # Not SummaryWriter: it writes in a thread, where an error of the disk is a traceback and no exception.
         self._events = EventsWriter(str(run / EVENTS / "events"))
         # TensorBoard hides the events of this step and later from files before this one.
-        start = _EVENTS.SessionLog(status=_EVENTS.SessionLog.START)
-        self._add_event(_EVENTS.Event(step=step, session_log=start))
+        start = _PB2.SessionLog(status=_PB2.SessionLog.START)
+        self._add_event(_PB2.Event(step=step, session_log=start))
         self._events.flush()
 
     def append(self, metrics: Mapping[str, np.ndarray], first: int, seconds: float) -> None:
@@ -117,7 +117,7 @@ class MetricsLog:
         for line in new:
             for name in line.keys() - {"iteration", "stage"}:
                 summary = scalar(f"{line['stage']}/{name}", line[name])
-                self._add_event(_EVENTS.Event(step=line["iteration"], summary=summary))
+                self._add_event(_PB2.Event(step=line["iteration"], summary=summary))
         self._events.flush()
         self.lines += new
 

@@ -1,6 +1,6 @@
 """Builds one MuJoCo model from a table, lights, a mount, an arm that hangs from the mount, an object and obstacles."""
 
-from vsearch_jax.scene.assembly import Scene, build_scene
+from vsearch_jax.scene.assembly import Scene, build_scene, object_symmetry
 from vsearch_jax.scene.files import SceneError, available, xml_folder
 from vsearch_jax.scene.fingerprint import Fingerprint, check_unchanged, scene_fingerprint
 from vsearch_jax.scene.joint_chain import joints_above
@@ -15,6 +15,7 @@ __all__ = [
     "check_unchanged",
     "describe_symmetry",
     "joints_above",
+    "object_symmetry",
     "scene_fingerprint",
     "xml_folder",
 ]

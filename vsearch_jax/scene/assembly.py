@@ -25,6 +25,7 @@ from vsearch_jax.scene.files import (
     xml_folder,
 )
 from vsearch_jax.scene.joint_chain import joints_above
+from vsearch_jax.scene.meshes import MESH_SUFFIXES
 from vsearch_jax.scene.surface import surface_points
 
 ARM_PREFIX = "arm/"
@@ -132,6 +133,18 @@ def build_scene(config: SceneConfig) -> Scene:
         symmetry=symmetry,
         object_points=surface_points(model, object_geom_ids),
     )
+
+
+def object_symmetry(config: SceneConfig) -> int:
+    """Returns `Scene.symmetry` without building the scene, which takes long for a large mesh.
+
+    Raises:
+      SceneError: the object's file is missing or cannot be loaded, or its symmetry is no whole number.
+    """
+    if config.symmetry is not None:
+        return config.symmetry
+    path = find_file("object", config.object)
+    return 1 if path.suffix.lower() in MESH_SUFFIXES else symmetry_of(load_static("object", path), path)
 
 
 def _compile_model(config: SceneConfig, arm_path: Path, object_path: Path, target: mujoco.MjSpec) -> mujoco.MjModel:

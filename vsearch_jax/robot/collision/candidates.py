@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -15,7 +15,7 @@ NEVER_NEAR = 0.05
 RESTING = 2e-5
 """m. A pair that is never farther apart than this, and never in contact, is left out."""
 NUM_CONFIGURATIONS = 64
-"""Random configurations in all of which a pair must rest to be left out."""
+"""Number of random configurations that stand for all of them."""
 
 
 class Geoms(NamedTuple):
@@ -95,14 +95,24 @@ def _resting_pairs(
         return gap <= RESTING and 0.0 < mujoco.mj_geomDistance(model, data, *pair, 2.0 * RESTING, None) <= RESTING
 
     resting = {pair for pair in pairs if rests(data, pair)}
-    other, random = mujoco.MjData(model), np.random.default_rng(0)
-    is_limited = model.jnt_limited.astype(bool)[:, None]
-    low, high = np.where(is_limited, model.jnt_range, [-np.pi, np.pi]).T
-    for _ in range(NUM_CONFIGURATIONS if resting else 0):
-        other.qpos[model.jnt_qposadr] = random.uniform(low, high)
-        mujoco.mj_kinematics(model, other)
+    for other in random_configurations(model) if resting else ():
         resting = {pair for pair in resting if rests(other, pair)}
     return resting
+
+
+def random_configurations(model: mujoco.MjModel) -> Iterator[mujoco.MjData]:
+    """Yields the kinematics of `NUM_CONFIGURATIONS` random joint values inside the limits, the same ones each time.
+
+    Args:
+      model: a model whose joints are hinges or slides. The same data is yielded again and again.
+    """
+    data, random = mujoco.MjData(model), np.random.default_rng(0)
+    is_limited = model.jnt_limited.astype(bool)[:, None]
+    low, high = np.where(is_limited, model.jnt_range, [-np.pi, np.pi]).T
+    for _ in range(NUM_CONFIGURATIONS):
+        data.qpos[model.jnt_qposadr] = random.uniform(low, high)
+        mujoco.mj_kinematics(model, data)
+        yield data
 
 
 def _can_come_near(model: mujoco.MjModel, data: mujoco.MjData, pair: tuple[int, int]) -> bool:
