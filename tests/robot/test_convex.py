@@ -10,8 +10,8 @@ from vsearch_jax.planning.starts import start_limits
 from vsearch_jax.robot import build_arm, forward_kinematics, is_free
 from vsearch_jax.robot.collision.candidates import Geoms, touching_pairs
 from vsearch_jax.robot.collision.convex import Frames, convex_distances
-from vsearch_jax.robot.collision.solids import MAX_VERTICES, box_corners, build_side, convex_solid, hull_vertices
-from vsearch_jax.scene import build_scene
+from vsearch_jax.robot.collision.solids import MAX_VERTICES, build_side, convex_solid, hull_vertices
+from vsearch_jax.scene import box_corners, build_scene
 
 # m. GJK stops after a fixed number of iterations, and rounding in float32 is subtracted.
 TOLERANCE = 3e-4

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from vsearch_jax.config import SceneConfig
+from vsearch_jax.scene import build_scene
 from vsearch_jax.scene.surface import surface_points
 
 
@@ -33,3 +35,13 @@ def test_points_of_the_surface_lie_as_far_out_as_the_solid_in_every_direction(ge
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     ours, theirs = ((points @ directions.T).max(axis=0) for points in (surface_points(model, [0]), vertices))
     np.testing.assert_allclose(ours, theirs, atol=0.006)  # round shapes are meshes of few faces
+
+
+def test_shapes_that_no_camera_sees_are_no_part_of_the_surface(tmp_path) -> None:
+    path = tmp_path / "part.xml"
+    ball, box = '<geom type="sphere" size=".05" pos="0 0 .05"/>', '<geom type="box" size=".1 .1 .1" group="3"/>'
+    path.write_text(f"<mujoco><worldbody><body>{ball}{box}</body></worldbody></mujoco>")
+    points = build_scene(SceneConfig(object=str(path))).object_points
+    np.testing.assert_allclose(
+        [points.min(axis=0), points.max(axis=0)], [[-0.05, -0.05, 0], [0.05, 0.05, 0.1]], atol=0.001
+    )

@@ -30,6 +30,8 @@ from vsearch_jax.scene.surface import surface_points
 
 ARM_PREFIX = "arm/"
 OBJECT_PREFIX = "object/"
+MAX_GROUP = 2
+"""Geoms of higher groups are shapes for collisions, which no camera sees."""
 OBSTACLE_PREFIX = "obstacle/"
 
 _LOG = logging.getLogger(__name__)
@@ -58,7 +60,7 @@ class Scene:
       obstacle_geom_ids: geoms of the obstacles.
       table_geom_id: the plane of the table.
       symmetry: number of turns about the vertical that map the object to itself; 1 for none, 0 for any turn.
-      object_points: f64[P, 3] m in world, corners of the convex hull of the object.
+      object_points: f64[P, 3] m in world, corners of the convex hull of the object's visible geoms.
     """
 
     mj_model: mujoco.MjModel
@@ -131,7 +133,7 @@ def build_scene(config: SceneConfig) -> Scene:
         obstacle_geom_ids=_geoms_below(model, model.body("obstacles").id),
         table_geom_id=model.geom("table").id,
         symmetry=symmetry,
-        object_points=surface_points(model, object_geom_ids),
+        object_points=surface_points(model, [g for g in object_geom_ids if model.geom_group[g] <= MAX_GROUP]),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import mujoco
@@ -52,8 +53,18 @@ def _local_points(model: mujoco.MjModel, geom: int) -> np.ndarray:
     if kind == _GEOM.mjGEOM_CAPSULE:
         end, offset = trimesh.creation.icosphere(subdivisions=2, radius=size[0]).vertices, np.array([0.0, 0.0, size[1]])
         return np.concatenate([end + offset, end - offset])
-    middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]  # a box, or the box around a height field
-    return middle + half * np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+    return box_corners(model, geom)  # of a box, or of the box around a height field
+
+
+def box_corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Returns f64[8, 3] m, the corners of a geom's bounding box in the frame of the geom.
+
+    Args:
+      model: the compiled model.
+      geom: MuJoCo's number of the geom.
+    """
+    center, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    return center + half_sizes * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def describe_symmetry(order: int) -> str:

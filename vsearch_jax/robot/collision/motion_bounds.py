@@ -5,13 +5,12 @@ Planning uses them to prove that nothing touches between two configurations.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
-from vsearch_jax.scene import joints_above
+from vsearch_jax.scene import box_corners, joints_above
 
 HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -120,6 +119,4 @@ def _enclosing_balls(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> t
     if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
         half_length = float(model.geom_size[geom, 1]) if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
         return data.geom_xpos[geom] + np.outer([-half_length, half_length], rotation[:, 2]), model.geom_size[geom, 0]
-    center, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-    corners = center + half_sizes * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    return data.geom_xpos[geom] + corners @ rotation.T, 0.0
+    return data.geom_xpos[geom] + box_corners(model, geom) @ rotation.T, 0.0

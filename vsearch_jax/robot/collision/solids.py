@@ -19,6 +19,7 @@ from jax import Array
 from scipy.spatial import ConvexHull
 
 from vsearch_jax.robot.collision.support import BLOCK, Side
+from vsearch_jax.scene import box_corners
 
 SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
@@ -97,17 +98,6 @@ def convex_solid(model: mujoco.MjModel, geom: int, is_box: bool = False) -> Soli
     if kind == ELLIPSOID:
         return _small_solid(np.zeros((1, 3)), radii=size)
     return _small_solid(box_corners(model, geom))
-
-
-def box_corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Returns f64[8, 3] m, the corners of a geom's bounding box in the frame of the geom.
-
-    Args:
-      model: the compiled model.
-      geom: MuJoCo's number of the geom, which is no plane.
-    """
-    center, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-    return center + half_sizes * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def hull_vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray:
