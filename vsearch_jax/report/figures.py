@@ -205,7 +205,8 @@ def _plot_errors(axes: Axes, errors: np.ndarray, label: str, unit: str, thesis_m
     median = np.median(errors)
     axes.axvline(float(median), color=INK, linewidth=1.2, label=f"median {median:.2f}{unit}")
     axes.axvline(thesis_mean, color=THESIS_COLOR, linestyle="--", label=f"thesis, mean {thesis_mean:g}{unit}")
-    axes.set(xlabel=f"{label}\nlast bar: also those above {limit:.3g}, up to {errors.max():.3g}", ylabel="episodes (%)")
+    last_bar = f"last bar: also those\nabove {limit:.3g}, up to {errors.max():.3g}"
+    axes.set(xlabel=f"{label}\n{last_bar}", ylabel="episodes (%)")
     _legend_above(axes)
 
 
