@@ -30,7 +30,7 @@ from jax import Array
 import vsearch_jax as vs
 from parts import PARTS
 from vsearch_jax import render, report
-from vsearch_jax.env import encoder_example, random_example_views
+from vsearch_jax.env import AUGMENTED, encoder_example, random_example_views
 from vsearch_jax.runs import write_atomically
 
 OBJECTS = {"teapot": 0, "plate": 1, "lever": 2, "gear": 2}
@@ -79,7 +79,7 @@ def measure(name: str, pieces: int, folder: Path, repeats: int) -> dict[str, str
     def examples(key: Array) -> object:
         views = random_example_views(key, env, jnp.bool_(False))
         one = functools.partial(encoder_example, env=env)
-        return jax.vmap(one, in_axes=(0, 0, None))(jax.random.split(key, _BATCH), views, jnp.bool_(False))
+        return jax.vmap(one, in_axes=(0, 0, None))(jax.random.split(key, _BATCH), views, jnp.int32(AUGMENTED))
 
     programs: dict[str, Callable[[Array], object]] = {
         "pose_ms": lambda key: jax.vmap(pose)(jax.random.split(key, _BATCH)),

@@ -71,6 +71,21 @@ def test_codes_with_the_wanted_cosines_have_no_loss():
     assert float(pose_loss.pose_loss(other, angles, CONFIG)) > 0.1
 
 
+def test_a_hidden_mark_costs_a_near_pair_no_more_than_linearly_and_a_far_pair_the_square():
+    """Two codes in a plane; the distance of unit codes a turn t apart is 2 sin(t / 2)."""
+
+    def loss(turn: float, angle_deg: float) -> float:
+        codes = jnp.asarray([[1.0, 0.0], [math.cos(turn), math.sin(turn)]])
+        angles = jnp.radians(jnp.asarray([[0.0, angle_deg], [angle_deg, 0.0]]))
+        return float(pose_loss.pose_loss(codes, angles, CONFIG))
+
+    near = [loss(2.0 * math.asin(0.5 * distance), 0.0) for distance in (0.0, 0.5, 1.0, 1.5)]
+    assert near[3] - near[2] == pytest.approx(near[2] - near[1], rel=0.03)
+    assert near[1] - near[0] < near[2] - near[1]
+    wanted = float(pose_loss.wanted_cosine(jnp.radians(90.0), CONFIG))
+    assert loss(0.0, 90.0) == pytest.approx((1.0 - wanted) ** 2, rel=1e-4)
+
+
 def test_matches_are_counted_as_by_loops():
     codes = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
     turns = Rotation.from_rotvec(np.random.default_rng(1).normal(scale=0.5, size=(30, 3))).as_matrix()

@@ -11,8 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vsearch_jax as vs
+from vsearch_jax import encoder as encoders
 from vsearch_jax.config import Config
-from vsearch_jax.env import random_example_views
+from vsearch_jax.env import AUGMENTED, CLEAN, SHADED, encoder_example, random_disturbances, random_example_views
+from vsearch_jax.types import View
 
 BAND_DEG = (40.0, 70.0)
 
@@ -49,3 +52,33 @@ def test_views_are_uniform_over_all_azimuths_and_the_band(loss):
     assert counts.min() > 0.75 * counts.mean() and counts.max() < 1.25 * counts.mean()
     counts, _ = np.histogram(elevation, bins=4, range=BAND_DEG)
     assert counts.min() > 0.75 * counts.mean() and counts.max() < 1.25 * counts.mean()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_the_views_of_a_group_share_their_disturbance(share):
+    config = dataclasses.replace(Config.preset("smoke").encoder, batch_size=402, shaded_share=share)
+    disturbances = np.asarray(random_disturbances(jax.random.key(0), config))
+    assert disturbances.shape == (402,)
+    groups = disturbances[:400].reshape(100, 4)
+    assert (groups == groups[:, :1]).all()
+    assert set(np.unique(groups)) <= {SHADED, AUGMENTED}
+    assert abs(np.mean(groups == SHADED) - share) < 0.12
+
+
+def test_a_clean_example_is_what_a_search_sees_and_a_shaded_one_is_darker_only():
+    config = Config.preset("smoke")
+    env = vs.ViewSearchEnv(config)
+    view = View(jnp.float32(2.0), jnp.mean(env.reach.band))
+    examples = jax.jit(jax.vmap(lambda key, disturbance: encoder_example(key, view, disturbance, env=env).inputs))
+    keys = jax.random.split(jax.random.key(0), 8)
+    clean, shaded, augmented = (np.asarray(examples(keys, jnp.full(8, d))) for d in (CLEAN, SHADED, AUGMENTED))
+
+    for i, key in enumerate(keys):
+        pose_key = jax.random.split(key, 5)[0]
+        qpos = env.resolve_view(view, env.random_joints(pose_key), jnp.bool_(False))[1]
+        seen = encoders.network_input(env.wrist_image(qpos)[1], env.scene.object_geom_ids, config)
+        np.testing.assert_allclose(clean[i], seen, atol=1e-4)
+    assert (shaded <= clean + 1e-4).all()
+    is_darker = (shaded < clean - 0.02).any(axis=(1, 2, 3))
+    assert 0.3 < is_darker.mean() < 1.0  # seven of ten examples get strips
+    assert (augmented > clean + 0.02).any(axis=(1, 2, 3)).all()

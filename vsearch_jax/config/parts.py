@@ -60,6 +60,8 @@ class EncoderConfig:
     """Angle between two views at which the pose loss wants the threshold as cosine, in degrees."""
     wide_weight: float = 0.3
     """Weight of the wide part of the cosine that the pose loss wants. The wide part leads back from the far side."""
+    shaded_share: float = 0.5
+    """Share of the examples that keep the scene's lights and camera, and get shadows only. The others get it all."""
     input: Literal["rgb", "depth", "silhouette"] = "rgb"
     """Part of the image that the encoder reads."""
     intensity: Literal["linear", "log"] = "log"
@@ -116,7 +118,7 @@ class EncoderConfig:
             self.decoder_size % 2 ** len(self.channels) == 0,
             f"a multiple of {2 ** len(self.channels)} (each layer of the decoder doubles the size)",
         )
-        require_unit(self, "bootstrap_fraction")
+        require_unit(self, "bootstrap_fraction", "shaded_share")
         require(self, "bootstrap_fraction", self.bootstrap_fraction > 0.0, "greater than 0, at most 1")
         require(self, "whitening_power", 0.0 <= self.whitening_power <= 0.5, "from 0 to 0.5")
         is_free = self.loss == "autoencoder" or self.whitening_power == 0.0

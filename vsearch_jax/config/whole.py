@@ -109,6 +109,7 @@ PRESETS: dict[str, Config] = {
     "autoencoder": Config(  # the preset cpu with the thesis's loss and optimizer, and a network that suits them
         encoder=EncoderConfig(
             loss="autoencoder",
+            shaded_share=0.0,
             intensity="linear",
             optimizer="adam",
             channels=(64, 128, 128),
@@ -121,6 +122,7 @@ PRESETS: dict[str, Config] = {
     "thesis": Config(
         encoder=EncoderConfig(
             loss="autoencoder",
+            shaded_share=0.0,
             intensity="linear",
             optimizer="adam",
             channels=(128, 256, 256, 512),

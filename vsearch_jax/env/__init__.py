@@ -12,12 +12,23 @@ from vsearch_jax.env.episode import (
     step_reward,
     zero_observation,
 )
-from vsearch_jax.env.examples import EncoderExample, encoder_example, random_example_views
+from vsearch_jax.env.examples import (
+    AUGMENTED,
+    CLEAN,
+    SHADED,
+    EncoderExample,
+    encoder_example,
+    random_disturbances,
+    random_example_views,
+)
 from vsearch_jax.env.parts import TaskParts, build_parts, check_jax_settings
 from vsearch_jax.env.task import ViewSearchEnv
 
 __all__ = [
+    "AUGMENTED",
+    "CLEAN",
     "FALSE_POSITIVE_DEG",
+    "SHADED",
     "EncoderExample",
     "TaskParts",
     "UnreachableError",
@@ -31,6 +42,7 @@ __all__ = [
     "obs_of",
     "pose_error",
     "protocol_target",
+    "random_disturbances",
     "random_example_views",
     "step_reward",
     "zero_observation",

@@ -10,7 +10,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from vsearch_jax import encoder as encoders
-from vsearch_jax.env import FALSE_POSITIVE_DEG, ViewSearchEnv, encoder_example, random_example_views
+from vsearch_jax.env import (
+    CLEAN,
+    FALSE_POSITIVE_DEG,
+    ViewSearchEnv,
+    encoder_example,
+    random_disturbances,
+    random_example_views,
+)
 from vsearch_jax.training.metrics import ENCODER_STAGE, Metrics
 from vsearch_jax.types import EncoderState, Observation
 
@@ -34,12 +41,12 @@ def encoder_iteration(
     Returns:
       The encoder after the update, and the metrics of the update by name, f32[] each.
     """
-    view_key, example_key = jax.random.split(jax.random.fold_in(key, i))
+    view_key, disturbance_key, example_key = jax.random.split(jax.random.fold_in(key, i), 3)
     is_clean = i % _CLEAN_INTERVAL == 0
     views = random_example_views(view_key, env, is_clean)
+    disturbances = jnp.where(is_clean, CLEAN, random_disturbances(disturbance_key, env.config.encoder))
     keys = jax.random.split(example_key, env.config.encoder.batch_size)
-    one_example = functools.partial(encoder_example, env=env)
-    inputs, targets, rotations = jax.vmap(one_example, in_axes=(0, 0, None))(keys, views, is_clean)
+    inputs, targets, rotations = jax.vmap(functools.partial(encoder_example, env=env))(keys, views, disturbances)
     angles = encoders.view_angles(rotations, env.scene.symmetry)
     encoder, loss, latents = encoders.update(encoder, inputs, targets, angles, env.config)
     if env.config.encoder.loss == "autoencoder":  # its codes are latents without their mean
