@@ -39,7 +39,7 @@ def test_a_group_holds_two_neighbours_of_a_view_and_one_of_the_view_turned_by_18
     first, others = azimuth[:, :1], azimuth[:, 1:4] - np.array([0.0, 0.0, 180.0])
     apart = (others - first + 180.0) % 360.0 - 180.0
     spread = np.sqrt(np.mean(apart**2, axis=0))
-    low, high = (1.6, 2.4) if is_clean else (4.5, 8.5)  # augmented: the root mean square of 3 to 10 degrees is 6.4
+    low, high = (1.6, 2.4) if is_clean else (3.0, 6.0)  # others: the root mean square of 1.5 to 8 degrees is 4.3
     assert ((spread > low) & (spread < high)).all(), spread
     groups_apart = (azimuth[:, 4] - azimuth[:, 0] + 180.0) % 360.0 - 180.0
     assert np.sqrt(np.mean(groups_apart**2)) > 60.0
@@ -80,5 +80,5 @@ def test_a_clean_example_is_what_a_search_sees_and_a_shaded_one_is_darker_only()
         np.testing.assert_allclose(clean[i], seen, atol=1e-4)
     assert (shaded <= clean + 1e-4).all()
     is_darker = (shaded < clean - 0.02).any(axis=(1, 2, 3))
-    assert 0.3 < is_darker.mean() < 1.0  # seven of ten examples get strips
+    assert is_darker.mean() > 0.5  # strips may fall beside table and object
     assert (augmented > clean + 0.02).any(axis=(1, 2, 3)).all()

@@ -60,7 +60,7 @@ class EncoderConfig:
     """Angle between two views at which the pose loss wants the threshold as cosine, in degrees."""
     wide_weight: float = 0.3
     """Weight of the wide part of the cosine that the pose loss wants. The wide part leads back from the far side."""
-    shaded_share: float = 0.5
+    shaded_share: float = 0.75
     """Share of the examples that keep the scene's lights and camera, and get shadows only. The others get it all."""
     input: Literal["rgb", "depth", "silhouette"] = "rgb"
     """Part of the image that the encoder reads."""

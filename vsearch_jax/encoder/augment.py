@@ -22,7 +22,7 @@ _DIFFUSE_RANGE, _SPECULAR_RANGE, _AMBIENT_RANGE, _TINT_RANGE = (0.4, 1.3), (0.0,
 # Camera: largest tilt as a part of the field of view, and range of the factor on the field of view.
 _MAX_SHIFT, _SCALE_RANGE = 0.05, (0.92, 1.08)
 # Image.
-_SHADOW_PROBABILITY, _NUM_SHADOWS, _SHADOW_RADIUS = 0.7, 2, (0.08, 0.3)
+_NUM_SHADOWS, _SHADOW_RADIUS = 2, (0.08, 0.3)
 _BACKGROUND_PROBABILITY = 0.5
 _TEXTURE_GRIDS = (1, 2, 8, 32)  # a colour, a gradient, patches, grain
 _NUM_OCCLUSIONS, _OCCLUSION_PROBABILITY, _MAX_OCCLUSION = 2, 0.4, 0.35
@@ -158,7 +158,7 @@ def replace_background(key: Array, x: Array, is_object: Array) -> Array:
 
 
 def draw_shade(key: Array, size: int) -> Array:
-    """Draws where the shadows of two links of an arm might fall: bool[size, size], empty with probability 0.3.
+    """Draws where the shadows of two links of an arm might fall: bool[size, size].
 
     The shadows are strips with round ends, of random place, direction, length and width. The arm's own shadows are
     rendered too, but few of them cover the object.
@@ -167,7 +167,7 @@ def draw_shade(key: Array, size: int) -> Array:
       key: PRNG key.
       size: height and width of the image in pixels.
     """
-    chance_key, start_key, angle_key, length_key, radius_key = jax.random.split(key, 5)
+    start_key, angle_key, length_key, radius_key = jax.random.split(key, 4)
     starts = jax.random.uniform(start_key, (_NUM_SHADOWS, 2))
     angles = jax.random.uniform(angle_key, (_NUM_SHADOWS,), maxval=2.0 * jnp.pi)
     lengths = jax.random.uniform(length_key, (_NUM_SHADOWS,))
@@ -178,7 +178,7 @@ def draw_shade(key: Array, size: int) -> Array:
         down, across, cos, sin = rows - row, columns - column, jnp.cos(angle), jnp.sin(angle)
         along = jnp.clip(down * cos + across * sin, 0.0, length)
         is_dark |= (down - along * cos) ** 2 + (across - along * sin) ** 2 < radius**2
-    return is_dark & jax.random.bernoulli(chance_key, _SHADOW_PROBABILITY)
+    return is_dark
 
 
 def occlude(key: Array, x: Array) -> Array:
