@@ -85,7 +85,7 @@ def random_disturbances(key: Array, config: EncoderConfig) -> Array:
 
     Searches meet the scene's own lights, and there the arm's shadow disturbs the most. On the gear of eval/parts.py, on
     the side where the shadow falls on the object, 74 % of the views 1 to 1.5 degrees apart match with half of the
-    examples shaded, 82 % with three quarters, and 92 % with nearer neighbours (`_NEIGHBOUR_DEG`) and a shadow in each, too.
+    examples shaded, 82 % with three quarters, and 92 % with nearer neighbours (`_NEIGHBOUR_DEG`) and a shadow in each.
 
     Args:
       key: PRNG key.
