@@ -56,7 +56,7 @@ class EncoderConfig:
 
     loss: Literal["autoencoder", "pose", "both"] = "pose"
     """Training: reconstruct the clean view (thesis), match cosines to the known angles between views, or both."""
-    threshold_angle_deg: float = 3.0
+    threshold_angle_deg: float = 2.5
     """Angle between two views at which the pose loss wants the threshold as cosine, in degrees."""
     wide_weight: float = 0.3
     """Weight of the wide part of the cosine that the pose loss wants. The wide part leads back from the far side."""
