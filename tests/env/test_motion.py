@@ -10,6 +10,7 @@ import pytest
 
 import vsearch_jax as vs
 from vsearch_jax.config import ConfigError, EnvConfig
+from vsearch_jax.env import motion as motions
 from vsearch_jax.geometry import view_pose
 from vsearch_jax.planning import duration, straight_duration, time_path
 from vsearch_jax.scene import SceneError, xml_folder
@@ -65,6 +66,25 @@ def test_path_ends_at_the_solution_of_inverse_kinematics(path_results, ik_result
     assert not np.any(has_path & ~np.asarray(is_solved))
     assert has_path.sum() >= 7
     np.testing.assert_allclose(path_results[0].qpos[has_path], qpos[has_path], atol=1e-5)
+
+
+def test_the_next_goal_is_tried_where_no_path_leads_to_one(env):
+    reached = env.reach.qpos[np.asarray(env.reach.is_reachable)]
+    start, free, other = reached[0], reached[len(reached) // 2], reached[-1]
+    outside = free.at[1].set(9.0)
+    goals = jnp.stack([outside, other, free])
+    assert CONFIG.planning.num_goals == 3
+
+    @jax.jit
+    def move(is_goal):
+        return motions.move_joints(env.scene, env.arm, start, lambda i: (goals[i], is_goal[i]), CONFIG)
+
+    moved, motion = move(jnp.asarray([True, False, True]))
+    assert bool(motion.is_found) and float(motion.travel) > 0.01
+    np.testing.assert_allclose(moved, free, atol=1e-5)
+    stayed, motion = move(jnp.asarray([True, False, False]))
+    assert not bool(motion.is_found)
+    np.testing.assert_array_equal(stayed, start)
 
 
 @pytest.mark.slow

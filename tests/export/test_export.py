@@ -68,7 +68,7 @@ def test_the_exported_functions_equal_the_direct_call(tmp_path: Path, kind: str)
         code = encoders.encode(state.encoder, encoders.network_input(image, jnp.asarray([7]), config), config)
         return code, sac.act(None, actor, jnp.concatenate([code, target, qpos]), config.sac)
 
-    for count in (1, 3):  # The batch may have any size.
+    for count in (1, 3):
         picture, image = pictures(kind, count, config.scene.image_size)
         target = jax.random.normal(jax.random.key(2), (count, config.encoder.code_size))
         qpos = jax.random.normal(jax.random.key(3), (count, NUM_JOINTS))
@@ -90,6 +90,20 @@ def test_the_interface_describes_the_files_and_they_run_without_the_package(tmp_
     ]
     assert [x["name"] for x in about["functions"]["policy"]["outputs"]] == ["action", "similarity"]
     assert set(about["functions"]["policy"]["platforms"]) == {"cpu", "cuda", "tpu"}
+    assert about["batch"].startswith("1 or more; JAX refuses other dtypes")
+    policy = jax.export.deserialize(bytearray((tmp_path / "policy.stablehlo").read_bytes()))
+
+    def act(count: int, code_type: type, picture_type: type = np.uint8) -> np.ndarray:
+        code, qpos = (
+            np.full((count, config.encoder.code_size), 0.1, code_type),
+            np.zeros((count, NUM_JOINTS), code_type),
+        )
+        return policy.call(np.zeros((count, size, size, 3), picture_type), code, qpos)[0]
+
+    np.testing.assert_array_equal(act(2, np.float64), act(2, np.float32))
+    for wrong in ((0, np.float32), (2, np.int32), (2, np.float32, np.float32)):
+        with pytest.raises(ValueError, match=r"polymorphic shapes|Dtype mismatch"):
+            act(*wrong)
     code = (
         "import sys; from pathlib import Path; import numpy as np; import jax.export;"
         f"f = jax.export.deserialize(bytearray(Path({str(tmp_path / 'encoder.stablehlo')!r}).read_bytes()));"

@@ -70,6 +70,8 @@ class PlanningConfig:
     """Smallest gap to an obstacle, in m. An edge that leads closer is rejected. See `planning.edge_is_free`."""
     num_shortcuts: int = 64
     """Number of attempts to shorten a path."""
+    num_goals: int = 3
+    """Number of IK solutions of a view to which a path is searched. The next is tried if no path leads to the last."""
     max_waypoints: int = 48
     """Maximum number of configurations in a path."""
     acceleration_time: float = 0.5
@@ -78,7 +80,7 @@ class PlanningConfig:
     """Time at the end of a motion in which a dynamic arm comes to rest, in s."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "num_nodes", "max_iterations", "step", "acceleration_time")
+        require_positive(self, "num_nodes", "max_iterations", "num_goals", "step", "acceleration_time")
         require(self, "resolution", 1e-4 <= self.resolution <= 0.1, "from 0.0001 to 0.1 m")
         require(self, "settling_time", self.settling_time >= 0.0, "0 or more")
         require(self, "num_shortcuts", self.num_shortcuts >= 0, "0 or more")

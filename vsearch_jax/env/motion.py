@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -20,6 +22,7 @@ from vsearch_jax.planning.execution import execute
 from vsearch_jax.robot.arm import Arm
 from vsearch_jax.scene import Scene
 from vsearch_jax.types import Path, PlanStatus
+from vsearch_jax.xla.tree import tree_where
 
 _PLANNING_SEED = 20_191_202
 """Seed of the random trees. It is fixed, so the path between two configurations is always the same."""
@@ -79,30 +82,57 @@ def plan_motion(arm: Arm, qpos: Array, goal: Array, config: PlanningConfig) -> t
     return trajectory, Motion(_is_found(path), path.length, duration(trajectory))
 
 
-def move_joints(scene: Scene, arm: Arm, qpos: Array, goal: Array, config: Config) -> tuple[Array, Motion]:
-    """Plans a path without contact to a goal, and moves the arm along it, kinematically or by the arm's dynamics.
+def move_joints(
+    scene: Scene, arm: Arm, qpos: Array, goals: Callable[[Array], tuple[Array, Array]], config: Config
+) -> tuple[Array, Motion]:
+    """Plans a path without contact to one of several goals, and moves the arm along it.
+
+    The goals are tried one after another, `planning.num_goals` at most, until a path leads to one.
 
     Args:
       scene: the scene. The MJX model in it is used for dynamic motion.
       arm: the arm.
       qpos: f32[nq] rad or m, joint values at the start.
-      goal: f32[nq] rad or m, joint values to reach.
-      config: the run's config; `env.motion` chooses kinematic or dynamic motion.
+      goals: returns for the number of a goal, i32[], its joint values f32[nq] rad or m; and bool[], whether there is
+        such a goal.
+      config: the run's config; `env.motion` chooses kinematic motion or the arm's simulated dynamics.
 
     Returns:
       Joint values after the motion, f32[nq] rad or m, and the cost of the planned motion. Kinematic motion ends at the
       goal. Dynamic motion follows the path and ends near the goal. If no path is found, the arm stays.
     """
+    path = _path_to_first(arm, qpos, goals, config.planning)
     is_kinematic = config.env.motion == "kinematic"
     if arm.joints_without_speed and is_kinematic:
-        path = _plan_path(arm, qpos, goal, config.planning)
         return path.waypoints[-1], Motion(_is_found(path), path.length, jnp.float32(jnp.nan))
-    trajectory, motion = plan_motion(arm, qpos, goal, config.planning)
+    trajectory = time_path(arm, path, config.planning)
+    motion = Motion(_is_found(path), path.length, duration(trajectory))
     if is_kinematic:
         return trajectory.waypoints[-1], motion
     reached = execute(arm, scene.mjx_model, trajectory, config.planning).qpos
     # MuJoCo's joint limits are soft. The next plan can only start inside the limits.
     return jnp.clip(reached, arm.lower, arm.upper), motion
+
+
+def _path_to_first(
+    arm: Arm, qpos: Array, goals: Callable[[Array], tuple[Array, Array]], config: PlanningConfig
+) -> Path:
+    """Returns a path to the first of the goals to which one is found; see `move_joints`."""
+
+    def attempt(number: Array, path: Path) -> Path:
+        goal, is_goal = goals(number)
+        is_open = is_goal & ~_is_found(path)
+        # Where nothing is to be planned, the goal is the start. The planner is then done at once.
+        planned = _plan_path(arm, qpos, jnp.where(is_open, goal, qpos), config)
+        return tree_where(is_open, planned, path)
+
+    stay = Path(
+        waypoints=jnp.broadcast_to(qpos[None], (config.max_waypoints, *qpos.shape)),
+        length=jnp.float32(jnp.inf),
+        status=jnp.int32(PlanStatus.GOAL_BLOCKED),
+    )
+    # A loop, so that IK and planner are compiled once.
+    return jax.lax.fori_loop(0, config.num_goals, attempt, stay)
 
 
 def _plan_path(arm: Arm, qpos: Array, goal: Array, config: PlanningConfig) -> Path:

@@ -25,6 +25,8 @@ from vsearch_jax.xla.tree import tree_where
 
 _REACH_SEED = 20_191_201
 """Seed of the reachability map. It is fixed, so the map does not depend on the run's seed."""
+_SOLUTION_SEED = 20_191_203
+"""Seed of the joints from which further IK solutions of a view are searched. Equal views give equal solutions."""
 
 
 class ViewSearchEnv(Env):
@@ -219,13 +221,35 @@ class ViewSearchEnv(Env):
           The observation after the motion, and the cost of the motion. If the view is unreachable, the arm stays and
           `is_found` of the cost is false.
         """
-        joints, is_reachable = self.solve_joints(view, qpos)
-        joints = jnp.where(is_reachable if is_over is None else is_reachable & ~is_over, joints, qpos)
-        has_path = self.config.env.reachable == "path"
-        joints, motion = self.move_joints(qpos, joints) if has_path else (joints, self.straight_motion(qpos, joints))
-        is_found = is_reachable & motion.is_found
-        costs = (jnp.where(is_found, cost, 0.0) for cost in (motion.travel, motion.duration))
-        return self.observe_view(view, joints), Motion(is_found, *costs)
+        is_wanted = jnp.bool_(True) if is_over is None else ~is_over
+        if self.config.env.reachable == "path":
+            joints, motion = self._move_along_path(view, qpos, is_wanted)
+        else:
+            solution, is_reachable = self.solve_joints(view, qpos)
+            joints = jnp.where(is_reachable & is_wanted, solution, qpos)
+            motion = self.straight_motion(qpos, joints)._replace(is_found=is_reachable)
+        costs = (jnp.where(motion.is_found, cost, 0.0) for cost in (motion.travel, motion.duration))
+        return self.observe_view(view, joints), Motion(motion.is_found, *costs)
+
+    def _move_along_path(self, view: View, qpos: Array, is_wanted: Array) -> tuple[Array, Motion]:
+        """Moves the arm along a planned path to the first IK solution of a view to which a path leads.
+
+        Args:
+          view: View to reach, f32[] rad.
+          qpos: f32[nq] rad or m, present joint values. The first solution is near them, the others near random ones.
+          is_wanted: bool[], whether the arm shall move.
+
+        Returns:
+          Joint values f32[nq] after the motion, and its cost. If no path is found, the arm stays.
+        """
+
+        def solution(number: Array) -> tuple[Array, Array]:
+            key = jax.random.fold_in(jax.random.key(_SOLUTION_SEED), number)
+            preferred = jnp.where(number == 0, qpos, self.random_joints(key))
+            joints, is_reachable = self.solve_joints(view, preferred)
+            return joints, is_reachable & is_wanted
+
+        return motions.move_joints(self.scene, self.arm, qpos, solution, self.config)
 
     def straight_motion(self, qpos: Array, goal: Array) -> Motion:
         """Returns the cost of a straight motion between two joint vectors. Obstacles are ignored.
@@ -235,17 +259,6 @@ class ViewSearchEnv(Env):
           goal: f32[nq] rad or m, joint values at the end.
         """
         return motions.straight_motion(self.arm, qpos, goal, self.config.planning)
-
-    def move_joints(self, qpos: Array, goal: Array) -> tuple[Array, Motion]:
-        """Moves the arm along a planned path. Returns joint values f32[nq] after the motion, and the motion's cost.
-
-        Kinematic motion ends at the goal, dynamic motion near it. If no path is found, the arm stays.
-
-        Args:
-          qpos: f32[nq] rad or m, joint values at the start.
-          goal: f32[nq] rad or m, joint values to reach.
-        """
-        return motions.move_joints(self.scene, self.arm, qpos, goal, self.config)
 
     def plan_motion(self, qpos: Array, goal: Array) -> tuple[Trajectory, Motion]:
         """Plans a timed motion without contact, and returns it with its cost. Equal arguments give equal results.

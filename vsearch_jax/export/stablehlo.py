@@ -84,7 +84,7 @@ def export(folder: Path, state: TrainState, config: Config, policy: int = 0) -> 
     """Exports encoder and one policy as StableHLO files, which run without this package.
 
     Writes `encoder.stablehlo`, `policy.stablehlo` and `interface.json`, which describes both. Both functions take
-    batches of any size. To call one:
+    batches of one or more. JAX refuses an empty batch and other dtypes, but rounds float64 to float32. To call one:
     `jax.export.deserialize(bytearray(path.read_bytes())).call(...)`.
 
     Args:
@@ -153,6 +153,7 @@ def _interface(exported: dict[str, jax.export.Exported], state: TrainState, conf
     return {
         "functions": functions,
         "policy": "the mean action of the trained policy; the policy has no memory",
+        "batch": "1 or more; JAX refuses other dtypes than the given ones, but rounds float64 to float32",
         "meaning": {
             "picture": _INPUT_MEANINGS[config.encoder.input],
             "code": "code of the picture; the policy's target_code is the code of the target picture",
