@@ -221,7 +221,7 @@ class ViewSearchEnv(Env):
           The observation after the motion, and the cost of the motion. If the view is unreachable, the arm stays and
           `is_found` of the cost is false.
         """
-        is_wanted = jnp.bool_(True) if is_over is None else ~is_over
+        is_wanted = True if is_over is None else ~is_over
         if self.config.env.reachable == "path":
             joints, motion = self._move_along_path(view, qpos, is_wanted)
         else:
@@ -231,22 +231,16 @@ class ViewSearchEnv(Env):
         costs = (jnp.where(motion.is_found, cost, 0.0) for cost in (motion.travel, motion.duration))
         return self.observe_view(view, joints), Motion(motion.is_found, *costs)
 
-    def _move_along_path(self, view: View, qpos: Array, is_wanted: Array) -> tuple[Array, Motion]:
+    def _move_along_path(self, view: View, qpos: Array, is_wanted: Array | bool) -> tuple[Array, Motion]:
         """Moves the arm along a planned path to the first IK solution of a view to which a path leads.
 
-        Args:
-          view: View to reach, f32[] rad.
-          qpos: f32[nq] rad or m, present joint values. The first solution is near them, the others near random ones.
-          is_wanted: bool[], whether the arm shall move.
-
-        Returns:
-          Joint values f32[nq] after the motion, and its cost. If no path is found, the arm stays.
+        The first solution is near the present joints `qpos`, the others are near random ones. Returns the joint values
+        f32[nq] after the motion, and its cost. If no path is found, or unless `is_wanted`, the arm stays.
         """
 
         def solution(number: Array) -> tuple[Array, Array]:
-            key = jax.random.fold_in(jax.random.key(_SOLUTION_SEED), number)
-            preferred = jnp.where(number == 0, qpos, self.random_joints(key))
-            joints, is_reachable = self.solve_joints(view, preferred)
+            random = self.random_joints(jax.random.fold_in(jax.random.key(_SOLUTION_SEED), number))
+            joints, is_reachable = self.solve_joints(view, jnp.where(number == 0, qpos, random))
             return joints, is_reachable & is_wanted
 
         return motions.move_joints(self.scene, self.arm, qpos, solution, self.config)
