@@ -76,15 +76,16 @@ def test_the_next_goal_is_tried_where_no_path_leads_to_one(env):
     assert CONFIG.planning.num_goals == 3
 
     @jax.jit
+    @jax.vmap
     def move(is_goal):
         return motions.move_joints(env.scene, env.arm, start, lambda i: (goals[i], is_goal[i]), CONFIG)
 
-    moved, motion = move(jnp.asarray([True, False, True]))
-    assert bool(motion.is_found) and float(motion.travel) > 0.01
-    np.testing.assert_allclose(moved, free, atol=1e-5)
-    stayed, motion = move(jnp.asarray([True, False, False]))
-    assert not bool(motion.is_found)
-    np.testing.assert_array_equal(stayed, start)
+    ends, found = move(
+        jnp.asarray([[True, False, True], [True, False, False], [False, True, True], [True, True, True]])
+    )
+    np.testing.assert_array_equal(found.is_found, [True, False, False, True])
+    np.testing.assert_allclose(ends, jnp.stack([free, start, start, other]), atol=1e-5)
+    assert (np.asarray(found.travel)[[0, 3]] > 0.01).all()
 
 
 @pytest.mark.slow

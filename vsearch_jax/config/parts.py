@@ -61,7 +61,7 @@ class EncoderConfig:
     wide_weight: float = 0.3
     """Weight of the wide part of the cosine that the pose loss wants. The wide part leads back from the far side."""
     shaded_share: float = 0.75
-    """Share of the examples that keep the scene's lights and camera, and get shadows only. The others get it all."""
+    """Share of the examples that keep the scene's lights and camera, and get shadows only. The others are augmented."""
     input: Literal["rgb", "depth", "silhouette"] = "rgb"
     """Part of the image that the encoder reads."""
     intensity: Literal["linear", "log"] = "log"

@@ -87,7 +87,8 @@ def move_joints(
 ) -> tuple[Array, Motion]:
     """Plans a path without contact to one of several goals, and moves the arm along it.
 
-    The goals are tried one after another, `planning.num_goals` at most, until a path leads to one.
+    The goals are tried one after another, `planning.num_goals` at most, until a path leads to one. Without a first goal
+    no other is tried.
 
     Args:
       scene: the scene. The MJX model in it is used for dynamic motion.
@@ -119,20 +120,22 @@ def _path_to_first(
 ) -> Path:
     """Returns a path to the first of the goals to which one is found; see `move_joints`."""
 
-    def attempt(number: Array, path: Path) -> Path:
+    def attempt(state: tuple[Array, Array, Path]) -> tuple[Array, Array, Path]:
+        number, is_open, path = state
         goal, is_goal = goals(number)
-        is_open = is_goal & ~_is_found(path)
         # Where nothing is to be planned, the goal is the start. The planner is then done at once.
-        planned = _plan_path(arm, qpos, jnp.where(is_open, goal, qpos), config)
-        return tree_where(is_open, planned, path)
+        planned = _plan_path(arm, qpos, jnp.where(is_open & is_goal, goal, qpos), config)
+        path = tree_where(is_goal, planned, path)
+        return number + 1, (is_goal | (number > 0)) & ~_is_found(path), path
 
     stay = Path(
         waypoints=jnp.broadcast_to(qpos[None], (config.max_waypoints, *qpos.shape)),
         length=jnp.float32(jnp.inf),
         status=jnp.int32(PlanStatus.GOAL_BLOCKED),
     )
-    # A loop, so that IK and planner are compiled once.
-    return jax.lax.fori_loop(0, config.num_goals, attempt, stay)
+    # One loop compiles IK and planner once. It ends as soon as no problem of a batch is open.
+    start = (jnp.int32(0), jnp.bool_(True), stay)
+    return jax.lax.while_loop(lambda state: state[1] & (state[0] < config.num_goals), attempt, start)[2]
 
 
 def _plan_path(arm: Arm, qpos: Array, goal: Array, config: PlanningConfig) -> Path:

@@ -30,9 +30,9 @@ from vsearch_jax.scene.surface import surface_points
 
 ARM_PREFIX = "arm/"
 OBJECT_PREFIX = "object/"
+OBSTACLE_PREFIX = "obstacle/"
 MAX_GROUP = 2
 """Geoms of higher groups are shapes for collisions, which no camera sees."""
-OBSTACLE_PREFIX = "obstacle/"
 
 _LOG = logging.getLogger(__name__)
 
